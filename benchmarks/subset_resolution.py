@@ -30,7 +30,7 @@ from modeharvest.idic.local.subsets import SubsetOptions, subset_field
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.speckle.pattern import Speckle
-from modeharvest.report.grades import star_report, write_star_grading
+from modeharvest.report.grades import star_report, write_grading
 from modeharvest.report.model import print_report
 from modeharvest.validation.scoring.attenuation import Attenuation
 from modeharvest.validation.scoring.star import (
@@ -71,7 +71,7 @@ def main() -> None:
             for width in options.widths
         }
         grading = StarGrading(star_set, tuple(ranked_grades(list(grades.values()))))
-        write_star_grading(out / "graded", grading)
+        write_grading(out / "graded", grading)
         print_report(star_report(grading), out / "graded")
     expected = ["theory", "this speckle"]
     columns = ["subset", "l10 [px]", *expected, "n [10⁻³ px]", *expected, "n l10 [px²]", *expected]

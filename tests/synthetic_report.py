@@ -18,7 +18,7 @@ from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, spectral_density
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.report.figures.experiment import ExperimentData
+from modeharvest.report.experiment import ExperimentData
 from modeharvest.runs.case import Case
 from modeharvest.validation.truth import Comparison
 

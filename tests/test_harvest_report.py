@@ -34,10 +34,10 @@ from modeharvest.report.figures.photographs import (
 )
 from modeharvest.report.model import write_page
 from modeharvest.report.photographs import (
-    frame_rows,
     key_numbers,
     mode_cards,
     notes,
+    number_cards,
     photograph_labels,
     photograph_panels,
     photographs_report,
@@ -219,7 +219,8 @@ def test_many_photographs_have_numbers_and_some_have_pictures(harvest: Harvest) 
     assert len(shown) == MOST_SHOWN
     first = next(k for k, moment in enumerate(moments) if moment.has_pattern)
     assert {frames[0], frames[first - 1], frames[first], frames[-1]} <= set(shown)
-    assert len(frame_rows(harvest_summary(long))) == 20
+    (every,) = number_cards(harvest_summary(long), [], {})[0].tables
+    assert len(every.rows) == 20
 
 
 def test_the_summary_is_plain_json(harvest: Harvest, summary: dict[str, Any]) -> None:

@@ -210,9 +210,8 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
     assert len(frame(found.tables, "Buckling")) == 3
     assert list(frame(found.tables, "Parameters")["level"]) == ["", "3.8 mm"]
     assert len(frame(found.attachments, "Every parameter")) == 2 * 7
-    figures = [figure for card in found.figures for figure in card.figures]
-    assert [f.name for f in figures] == ["parameters", "overlaps", "patterns", "others"]
-    assert all(figure.draw().axes for figure in figures)
+    assert list(found.figures) == ["parameters", "overlaps", "patterns", "others"]
+    assert all(draw().axes for draw in found.figures.values())
 
 
 def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:

@@ -19,6 +19,12 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.waves import PlaneWave
+from modeharvest.report.experiment import (
+    ExperimentData,
+    SnapshotState,
+    draw_hero,
+    snapshot_panels,
+)
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import (
     draw_convergence,
@@ -26,12 +32,6 @@ from modeharvest.report.figures.curves import (
     draw_eigenvalues,
     draw_load,
     pattern_density,
-)
-from modeharvest.report.figures.experiment import (
-    ExperimentData,
-    SnapshotState,
-    draw_hero,
-    snapshot_panels,
 )
 from modeharvest.report.figures.fits import Panel
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field

@@ -17,13 +17,15 @@ import synthetic_report as made_up
 from html_page import Page
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.report.experiment import experiment_figures, experiment_report, notes
-from modeharvest.report.figures import fits
-from modeharvest.report.figures.experiment import (
+from modeharvest.report.experiment import (
     ExperimentData,
     SnapshotState,
+    experiment_figures,
+    experiment_report,
+    notes,
     snapshot_panels,
 )
+from modeharvest.report.figures import fits
 from modeharvest.report.model import Measured, draw_figures, fixed, number, print_report, write_page
 
 

@@ -218,7 +218,7 @@ def test_findings_of_a_resolution_study(
     # Theory: a subset's n l10 is 3.99 sqrt(2) s / G.
     assert 0.3 < found.numbers["affine_subset_indicator_px2"] < 3.0
     assert len(found.figures) == 4
-    assert all(f.draw().axes for card in found.figures for f in card.figures)
+    assert all(draw().axes for draw in found.figures.values())
     assert len(found.text) == 7
     assert not any("nan" in sentence for sentence in found.text)
 

@@ -248,8 +248,8 @@ def test_noise_study_on_tiny_images(
     assert 0.6 < summary.loc["u", "rms error / bound"] < 1.6
     assert len(frame(found.attachments, "Each unknown")) == 77
     plots = {"causes", "bars", "ratio", "bias", "coverage", "unknowns", "maps"}
-    assert plots == {f.name for card in found.figures for f in card.figures}
-    assert all(f.draw().axes for card in found.figures for f in card.figures)
+    assert plots == set(found.figures)
+    assert all(draw().axes for draw in found.figures.values())
     # n and -n push the other way: what is common to them is of second order.
     plus, minus = (np.array(r["unknowns"]) - rows[0]["unknowns"] for r in rows[1:3])
     assert np.linalg.norm(plus + minus) < 0.5 * np.linalg.norm(plus - minus)

@@ -21,7 +21,7 @@ import numpy as np
 from modeharvest.idic.local.field import LocalField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.typed import quantities, quantity, to_plain
+from modeharvest.util.typed import headings, quantity, to_plain
 from modeharvest.validation.scoring.attenuation import Attenuation
 from modeharvest.validation.scoring.star import KEPT, Star, StarSet
 
@@ -80,9 +80,8 @@ class GradeNumbers:
         )  # fmt: skip
 
 
-GRADE_COLUMNS = {
-    f"{label} [{unit}]" if unit else label: name for label, unit, name in quantities(GradeNumbers)
-}
+GRADE_COLUMNS = headings(GradeNumbers)
+"""Of the table, by the names of the numbers."""
 
 
 def grade_numbers(grade: StarGrade) -> dict[str, Any]:
@@ -105,10 +104,10 @@ def star_summary(grading: StarGrading) -> dict[str, Any]:
 
 def star_csv_lines(grades: Sequence[StarGrade]) -> Iterator[str]:
     """The table as CSV."""
-    yield ",".join(["name", *GRADE_COLUMNS])
+    yield ",".join(["name", *GRADE_COLUMNS.values()])
     for grade in grades:
         row = grade_numbers(grade)
-        values = [row[key] for key in GRADE_COLUMNS.values()]
+        values = [row[key] for key in GRADE_COLUMNS]
         cells = ["" if v is None else f"{v:.6g}" for v in values]
         yield ",".join([f'"{grade.name}"', *cells])
 

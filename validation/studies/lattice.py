@@ -31,7 +31,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.files import reading, write_csv
 from modeharvest.util.progress import Progress, counted, silent
-from modeharvest.util.typed import nearest, quantities, quantity
+from modeharvest.util.typed import headings, nearest, quantity
 
 if TYPE_CHECKING:
     from modeharvest.fem.bloch.critical import LatticeCritical
@@ -80,7 +80,7 @@ class ModeRow:
         return self.kind == "pattern"
 
 
-_HEADS = {name: f"{label} [{unit}]" if unit else label for label, unit, name in quantities(ModeRow)}
+_HEADS = headings(ModeRow)
 _ROWS = TypeAdapter(tuple[ModeRow, ...])
 
 

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
-from modeharvest.idic.spectra.pattern import REFERENCE_MODE
+from modeharvest.idic.result import Result
+from modeharvest.idic.spectra.pattern import REFERENCE_MODE, WavePattern
+from modeharvest.idic.spectra.spectrum import Spectrum
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.report.figures import fits, style
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import draw_eigenvalues, draw_load
-from modeharvest.report.figures.experiment import (
-    ExperimentData,
-    draw_hero,
-    snapshot_label,
-    snapshot_panels,
-)
-from modeharvest.report.figures.fits import convergence_card, panel_sections, shape_numbers
-from modeharvest.report.figures.whole_field import whole_panel_numbers
+from modeharvest.report.figures.maps import ColourScale, draw_blend, draw_field, draw_image
+from modeharvest.report.figures.whole_field import WholeMaps, whole_panel_numbers
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -35,9 +36,11 @@ from modeharvest.report.model import (
     percent,
     text_of,
 )
-from modeharvest.util.typed import quantities
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.typed import headings
 from modeharvest.validation.summary import SnapshotSummary
-from modeharvest.validation.whole_field import WholeFieldSummary
+from modeharvest.validation.truth import Comparison, lengths, pattern_field
+from modeharvest.validation.whole_field import WholeField, WholeFieldSummary
 
 Snapshot = Mapping[str, Any]
 Summary = Mapping[str, Any]
@@ -54,6 +57,137 @@ _MODE = tuple(
 )
 
 
+@dataclass(frozen=True, eq=False)
+class ExperimentData:
+    """What the figures of a virtual experiment are drawn from, snapshots by ascending strain."""
+
+    solution: Solution
+    images: ImageSet
+    strains: Sequence[float]
+    """Nominal strain of each snapshot [-]."""
+    results: Sequence[Result]
+    comparisons: Sequence[Comparison]
+    """Of each with the truth; may still be computed."""
+    spectra: Sequence[tuple[Spectrum, WavePattern]]
+    """Of each its spectral densities and what is read off them; may still be computed."""
+    pitch: float
+    """Unit cell size l [mm]."""
+    wholes: Sequence[tuple[WholeField, WholeFieldSummary]] = ()
+    """Of each the whole displacement and its errors, if measured; may still be computed."""
+
+    @cached_property
+    def states(self) -> list[SnapshotState]:
+        """All snapshots."""
+        boundary, images = MeshBoundary.of(self.solution.mesh), self.images
+        view = fits.SpecimenView(boundary, images.grid, images.mask(), self.pitch)
+        return [
+            SnapshotState(f"{round(1e4 * strain):04d}", self._label(strain), view, result,
+                          partial(self._densities, k), self, k)
+            for k, (strain, result) in enumerate(zip(self.strains, self.results, strict=True))
+        ]  # fmt: skip
+
+    @property
+    def modes(self) -> int:
+        """How many modes every snapshot has."""
+        return min(len(result.ansatz.modes) for result in self.results)
+
+    def _label(self, strain: float) -> str:
+        critical = self.solution.info.get("critical")
+        at = None if critical is None else critical["strain"]
+        return snapshot_label(strain, self.solution.at(strain).branch, at)
+
+    @cached_property
+    def _density_end(self) -> float:
+        return fits.largest_density(self.spectra)
+
+    def _densities(self, k: int) -> tuple[Spectrum, WavePattern, float]:
+        return (*self.spectra[k], self._density_end)
+
+
+@dataclass(frozen=True, eq=False)
+class SnapshotState(fits.FittedState):
+    """A snapshot: number ``k`` of ``data``."""
+
+    data: ExperimentData
+    k: int
+
+    @property
+    def comparison(self) -> Comparison:
+        """With the truth."""
+        return self.data.comparisons[self.k]
+
+
+def snapshot_label(strain: float, branch: str, critical: float | None) -> str:
+    """What a snapshot is called on the page; strains [-], None without a critical one."""
+    if branch != "primary":
+        state = "After buckling"
+    elif critical is None:
+        state = "Deformed"
+    else:
+        state = "Before buckling" if strain < critical else "Unstable path"
+    return f"{state} · {100 * strain:.4g} %"
+
+
+def draw_hero(state: SnapshotState) -> Figure:
+    """The deformed image turning into the pattern that was measured in it."""
+    images, strain = state.data.images, state.data.strains[state.k]
+    map_frame = state.view.map_frame()
+    if fits.has_mode(0)(state):
+        length = fits.UM * lengths(pattern_field(state.result, map_frame.grid))
+    else:
+        length = map_frame.average(fits.UM * lengths(state.comparison.w))
+    end = ColourScale.size(state.view.on_material(length), "µm")
+    return draw_blend(
+        map_frame, images.deformed(strain), images.deformed_mask(strain), images.grid, length,
+        ColourScale(style.GLOW, 0.0, end.high, "µm"), state.motion,
+    )  # fmt: skip
+
+
+def _image(state: SnapshotState) -> Figure:
+    images, strain = state.data.images, state.data.strains[state.k]
+    return draw_image(
+        state.view.map_frame(), images.deformed(strain), images.deformed_mask(strain), images.grid,
+        state.data.solution.at(strain).displacement,
+    )  # fmt: skip
+
+
+def _residual(state: SnapshotState) -> Figure:
+    map_frame = state.view.map_frame(fits.FINE)
+    residual = map_frame.sample(state.comparison.residual)
+    return draw_field(map_frame, residual, ColourScale.signed(residual, "", 0.99), state.motion)
+
+
+def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
+    """The length of one of the comparison's vector fields."""
+
+    def draw(state: SnapshotState) -> Figure:
+        field: FloatArray = getattr(state.comparison, name)
+        return fits.draw_length(state, state.view.map_frame().average(lengths(field)))
+
+    return draw
+
+
+_WHOLE_MAPS: WholeMaps[SnapshotState] = WholeMaps(
+    lambda state: state.data.wholes[state.k][0], lambda state: state.comparison,
+    lambda state: len(state.data.wholes) > 0,
+)  # fmt: skip
+
+
+def snapshot_panels(modes: int) -> list[fits.Panel[SnapshotState]]:
+    """Every quantity that is drawn of a snapshot, for an ansatz of so many modes."""
+    spectra, fields = ("spect_virt", "virt") if modes <= 1 else ("", "")  # the paper has one
+    return [
+        fits.Panel("images", "image", _image, figure=spectra),
+        *fits.spectrum_panels("images", spectra, "snapshots", fits.always),
+        *fits.ansatz_panels("found", fields, modes),
+        fits.Panel("errors", "residual", _residual, figure=fields, exact=True, late=True),
+        fits.Panel("errors", "w", _length_of("w"), figure=fields, late=True),
+        fits.Panel("errors", "best", _length_of("best_error"), late=True),
+        fits.Panel("errors", "loss", _length_of("idic_to_best"), late=True),
+        *_WHOLE_MAPS.panels(fields, "whole-w"),
+    ]
+
+
 def experiment_report(summary: Summary, data: ExperimentData | None = None) -> Report:
     """The report of a virtual experiment.
 
@@ -65,73 +199,58 @@ def experiment_report(summary: Summary, data: ExperimentData | None = None) -> R
     seeds = [f"speckle {case['imaging']['speckle']['seed']}"] if "imaging" in case else []
     seeds += [f"imperfection {imperfection['seed']}"] if imperfection else []
     material = case.get("experiment", {}).get("material")
-    factorisations = number(summary.get("factorisations"))
     residual = number(summary["inverse_map_max_residual_px"])
     states, snapshots = data.states if data is not None else [], summary["snapshots"]
-    steps = [convergence_card(s, snapshots[s.k]["outcome_why"]) for s in states]
+    brief = [(percent(s["nominal_strain"]), s) for s in snapshots]
+    steps = [fits.convergence_card(s, snapshots[s.k]["outcome_why"]) for s in states]
     return Report(
         kind="virtual experiment",
         title=summary.get("title") or "Validation",
-        lead=caption("page-experiment")["lead"],
-        findings=(
-            [critical_line(summary.get("critical_strain"), material)]
-            + [text for text in (_expected(summary), *_energies(summary)) if text]
-        ),
+        findings=[
+            critical_line(summary.get("critical_strain"), material),
+            *_expected(summary.get("expected", [])),
+            *_energies(summary),
+        ],
         keys=key_numbers(summary),
-        brief=ReportTable(
-            "Results",
-            ("nominal strain", *(percent(s["nominal_strain"]) for s in snapshots)),
-            _rows(snapshots, _BRIEF),
-        ),
+        brief=ReportTable.of_states("Results", "nominal strain", _BRIEF, brief),
         sections=[
-            Section("expected", "Obtained and expected values", _expected_cards(summary)),
+            Section.of("expected", expected_cards("expected", summary.get("expected", []))),
             *([] if data is None else _figures(data, summary)),
-            Section("numbers", "Numbers", number_cards(summary)),
+            Section.of("numbers", number_cards(summary)),
             Section.of("solver", steps),
         ],
         warnings=summary.get("warnings", []),
         notes=notes(summary),
-        command="modeharvest run CASE --out DIR",
-        remark="CASE is the name of a shipped case (paper-virtual is the paper’s) or a TOML file "
-        f"with the values below. Seeds: {', '.join(seeds)}.",
         case=case,
         costs={
-            "factorisations of the whole path": factorisations,
+            "factorisations of the whole path": number(summary.get("factorisations")),
             "largest residual of the inverse mapping": f"{residual} px",
         },
         versions=summary.get("versions", {}),
         hero=_hero(data) if data is not None else None,
         hero_caption=text_of("experiment-hero", state=states[-1].label if states else ""),
+        **caption("page-experiment", seeds=", ".join(seeds)),
     )
 
 
 def critical_line(strain: float | None, material: Mapping[str, Any] | None) -> str:
     """A sentence on the critical strain [-], None if the path has no bifurcation, and of what."""
-    text = "No bifurcation on the path (stable, imperfect, or odd numbers of holes both ways)"
+    text = text_of("experiment-no-bifurcation")
     if strain is not None:
         text = f"Critical strain {100 * strain:.4f} %"
     return f"{text}; {material_text(material)}." if material else f"{text}."
 
 
-def _expected(summary: Summary) -> str:
-    rows = summary.get("expected", [])
-    missed = [
-        f"{row['quantity']}: expected {row['expected']}, obtained {row['obtained']:.4g} "
-        f"{row['unit']}"
-        for row in rows
-        if not row["ok"]
-    ]
+def _expected(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    missed = [text_of("experiment-missed-value", **row) for row in rows if not row["ok"]]
     if missed:
-        return f"Missed {len(missed)} of {len(rows)} expected values: {'; '.join(missed)}."
-    return f"All {len(rows)} expected values are met." if rows else ""
+        return [f"Missed {len(missed)} of {len(rows)} expected values: {'; '.join(missed)}."]
+    return [f"All {len(rows)} expected values are met."] if rows else []
 
 
 def _energies(summary: Summary) -> list[str]:
-    return [
-        text_of("experiment-energy", at=percent(row["nominal_strain"]),
-                stable=number(row["branch_N"]), unstable=number(row["unstable_N"]))
-        for row in summary.get("energy_below_unstable", [])
-    ]  # fmt: skip
+    rows = summary.get("energy_below_unstable", [])
+    return [text_of("experiment-energy", **row) for row in rows]
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
@@ -140,37 +259,31 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
     at = f"at {percent(last['nominal_strain'])}"
     critical = summary.get("critical_strain")
     expected, whole = summary.get("expected", []), last.get("whole_field")
-    met = sum(bool(row["ok"]) for row in expected)
+    met = f"{sum(bool(row['ok']) for row in expected)} of {len(expected)}"
 
-    def key(name: str, value: float | None, unit: str, remark: str, digits: int = 3) -> KeyNumber:
-        known = value is not None and value == value
-        return KeyNumber(name, f"{value:.{digits}g}" if known else None, unit, remark)
+    def key(name: str, value: float | None, digits: int = 3) -> KeyNumber:
+        known = None if value is None or value != value else f"{value:.{digits}g}"
+        return KeyNumber.of(name, known, symbol=_symbol(last), at=at)
 
     return [
-        key("critical strain", None if critical is None else 100 * critical, "%",
-            "none found" if critical is None else "where the pattern sets in", 4),
-        key("pattern", last["pattern_amplitude_px"], "px", f"largest {_symbol(last)} {at}"),
+        key("not-critical", None) if critical is None else key("critical", 100 * critical, 4),
+        key("pattern", last["pattern_amplitude_px"]),
         _mode_key(last, at),
-        key("model (ansatz) error", last["rms_best_fit_px"], "px", f"rms of truth − best fit {at}"),
-        key("measurement error", last["rms_idic_to_best_fit_px"], "px",
-            f"rms of IDIC − best fit {at}", 2),
-        *([key("whole displacement", whole["rms_px"], "px",
-               f"rms of truth − measured up to all edges {at}", 2)] if whole else []),
-        KeyNumber("expected values met", f"{met} of {len(expected)}" if expected else None, "",
-                  "table below" if expected else "none known for this specimen"),
-    ]  # fmt: skip
+        key("best-fit", last["rms_best_fit_px"]),
+        key("loss", last["rms_idic_to_best_fit_px"], 2),
+        *([key("whole", whole["rms_px"], 2)] if whole else []),
+        KeyNumber.of("expected", met) if expected else key("not-expected", None),
+    ]
 
 
 def _mode_key(last: Snapshot, at: str) -> KeyNumber:
     """The mode against the ideal one; of several modes, how many are observable."""
     if "modes" in last:
         observable = [mode["observable"] for mode in last["modes"]]
-        count = f"{sum(observable)} of {len(observable)}"
-        return KeyNumber("modes", count, "", f"observable {at}")
+        return KeyNumber.of("modes", f"{sum(observable)} of {len(observable)}", at=at)
     if not _is_free(last):
-        return KeyNumber("deviation of the mode", None, "", "fixed at the ideal pattern")
-    remark = f"from the ideal pattern, the largest of a₁ … a₇ {at}"
-    return KeyNumber("deviation of the mode", f"{_largest_deviation(last):.2g}", "%", remark)
+        return KeyNumber.of("fixed-mode", None)
+    return KeyNumber.of("mode", f"{_largest_deviation(last):.2g}", at=at)
 
 
 def _symbol(snapshot: Snapshot) -> str:
@@ -178,44 +291,26 @@ def _symbol(snapshot: Snapshot) -> str:
     return "Σ vᵢφᵢ" if "modes" in snapshot else "v₁φ₁"
 
 
-def _expected_cards(summary: Summary) -> list[Card]:
-    rows = [
-        (row["quantity"], row["obtained"], row["unit"].replace("-", "–"), row["expected"],
-         verdict(row["ok"]), row["source"])
-        for row in summary.get("expected", [])
-    ]  # fmt: skip
-    columns = ("quantity", "obtained", "unit", "expected", "", "source")
-    table = ReportTable("Expected values", columns, rows, name="expected-values")
-    return Card.tabular(table, wide=True)
-
-
-def verdict(ok: bool) -> Mark:
-    """Whether an expected value was met."""
-    return Mark("✓ met" if ok else "✗ missed", ok)
+def expected_cards(name: str, rows: Sequence[Mapping[str, Any]]) -> list[Card]:
+    """The table of that name of obtained values against expected ones, and which were met."""
+    met, missed = Mark("✓ met", True), Mark("✗ missed", False)
+    records = [{**row, "unit": row["unit"].replace("-", "–"), "ok": met if row["ok"] else missed}
+               for row in rows]  # fmt: skip
+    return Card.tabular(ReportTable.of(name, records), wide=True)
 
 
 def number_cards(summary: Summary) -> list[Card]:
     """Tables of all snapshots; rows that no snapshot has are left out."""
     snapshots, critical = summary["snapshots"], summary.get("critical_strain")
-    symbol = _symbol(snapshots[0])
-    heads = {name: f"{label} [{unit}]" if unit not in ("", "–") else label
-             for kind in (SnapshotSummary, WholeFieldSummary)
-             for label, unit, name in quantities(kind)}  # fmt: skip
-    rows = _rows(
-        [{**s, **s.get("whole_field", {})} for s in snapshots],
-        {k: label.replace("v₁φ₁", symbol) for k, label in heads.items()},
-    )
-    labels = [snapshot_label(s["nominal_strain"], s["branch"], critical) for s in snapshots]
-    columns = ("rms: per component, all material", *labels)
-    table = ReportTable("Results", columns, rows, name="results")
+    heads = headings(SnapshotSummary, WholeFieldSummary)
+    heads = {k: head.replace("v₁φ₁", _symbol(snapshots[0])) for k, head in heads.items()}
+    states = [
+        (snapshot_label(s["nominal_strain"], s["branch"], critical), s | s.get("whole_field", {}))
+        for s in snapshots
+    ]
+    corner = "rms: per component, all material"
+    table = ReportTable.of_states("Results", corner, heads, states, name="results")
     return [*Card.tabular(table, wide=True), *_mode_cards(summary)]
-
-
-def _rows(snapshots: Sequence[Snapshot], labels: Mapping[str, str]) -> list[list[Cell]]:
-    """A row for each quantity that a snapshot has."""
-    rows: list[list[Cell]] = [[label, *(s.get(name) for s in snapshots)]
-                              for name, label in labels.items()]  # fmt: skip
-    return [row for row in rows if any(value is not None for value in row[1:])]
 
 
 def _mode_cards(summary: Summary) -> list[Card]:
@@ -264,7 +359,7 @@ def experiment_figures(data: ExperimentData) -> list[ReportFigure]:
     panels = snapshot_panels(data.modes)
     cards = [
         *_path_cards(data.solution),
-        *(convergence_card(state) for state in data.states),
+        *(fits.convergence_card(state) for state in data.states),
         *(panel.card(data.states, lambda key, state: "") for panel in panels),
     ]
     return [_hero(data), *(figure for card in cards for figure in card.figures)]
@@ -278,9 +373,9 @@ def _hero(data: ExperimentData) -> ReportFigure:
 def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
     snapshots: Sequence[Snapshot] = summary["snapshots"]
     several = data.modes > 1
-    images, found, errors, whole = panel_sections(
+    images, *others = fits.panel_sections(
         ("images", "found", "errors", "whole"), snapshot_panels(data.modes), data.states,
-        lambda key, state: panel_numbers(key, snapshots[state.k]) or shape_numbers(key, state),
+        lambda key, state: panel_numbers(key, snapshots[state.k]) or fits.shape_numbers(key, state),
         pattern=Markup("Σ v<sub>i</sub>φ<sub>i</sub>" if several else "v<sub>1</sub>φ<sub>1</sub>"),
         of_spectra="" if several else "Fig. “spect_virt” of the paper. ",
         known="",
@@ -288,14 +383,8 @@ def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
     )  # fmt: skip
     text = {s.label: snapshots[s.k].get("pattern_reading", ()) for s in data.states}
     reading = Card("Reading of the densities", text=text, name="reading")
-    cards = [*images.cards[:2], reading, *images.cards[2:]]
-    return [
-        Section("path", "Load path", _path_cards(data.solution)),
-        Section(images.name, images.title, cards, images.lead),
-        found,
-        errors,
-        *([whole] if whole.cards else []),
-    ]
+    images = replace(images, cards=[*images.cards[:2], reading, *images.cards[2:]])
+    return [Section.of("path", _path_cards(data.solution)), images, *others]
 
 
 def panel_numbers(key: str, snapshot: Snapshot) -> str:
@@ -321,20 +410,16 @@ def _path_cards(solution: Solution) -> list[Card]:
 
 def notes(summary: Summary) -> list[str]:
     """What a reader should know before trusting the numbers, drawn from the data."""
-    text = []
-    if not summary.get("expected"):
-        text.append("No expected values are known for this specimen: nothing to compare with.")
-    if str(summary.get("simulation_outcome") or "complete") != "complete":
-        text.append(f"The simulation is {summary['simulation_outcome']}.")
-    for snapshot in summary["snapshots"]:
-        text += _about(snapshot)
-    text += [
+    expected, outcome = summary.get("expected"), summary.get("simulation_outcome") or "complete"
+    return [
+        *([] if expected else [text_of("experiment-not-expected")]),
+        *([] if outcome == "complete" else [f"The simulation is {outcome}."]),
+        *(text for snapshot in summary["snapshots"] for text in _about(snapshot)),
         _standard_errors(summary),
         text_of("experiment-weights"),
         text_of("experiment-rms"),
-        *([text_of("experiment-material")] if summary.get("expected") else []),
+        *([text_of("experiment-material")] if expected else []),
     ]
-    return text
 
 
 def _standard_errors(summary: Summary) -> str:
@@ -356,29 +441,26 @@ def _about(snapshot: Snapshot) -> list[str]:
     if snapshot.get("negative_pivots"):
         text.append(text_of("experiment-unstable", at=at, pivots=snapshot["negative_pivots"]))
     if snapshot["outcome"] != "converged":
-        text.append(f"{at} the correlation ended as “{snapshot['outcome']}”: "
-                    f"{snapshot['outcome_why']}")  # fmt: skip
+        text.append(f"{at} {outcome_text(snapshot)}")
     if snapshot.get("undetermined"):
         text.append(f"{at} the images do not determine {', '.join(snapshot['undetermined'])}.")
     text += [f"{at} {warning}." for warning in snapshot.get("identifiability_warnings", ())]
-    text += [f"{at} {_lower(snapshot[key])}" for key in ("residual_verdict",) if key in snapshot]
+    if "residual_verdict" in snapshot:
+        text.append(f"{at} {_lower(snapshot['residual_verdict'])}")
     if snapshot.get("noise_sd") and "weighting" in snapshot:  # a choice that noise asks for
         text.append(f"{at} {_lower(snapshot['weighting'])}")
     inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
     if inner is not None and corners is not None and inner < corners:
-        deviation = _largest_deviation(snapshot)
-        describes = (
-            "The modes describe"
-            if "modes" in snapshot
-            else f"The mode's parameters (up to {deviation:.0f} % off the ideal) describe"
-            if _is_free(snapshot)
-            else "Fixed at the ideal pattern, the mode describes"
-        )
-        text.append(text_of(
-            "experiment-no-pattern", at=at, symbol=_symbol(snapshot), inner=inner, corners=corners,
-            describes=describes,
-        ))  # fmt: skip
+        kind = "several" if "modes" in snapshot else "free" if _is_free(snapshot) else "fixed"
+        describes = text_of(f"experiment-{kind}", deviation=_largest_deviation(snapshot))
+        text.append(text_of("experiment-no-pattern", at=at, symbol=_symbol(snapshot), inner=inner,
+                            corners=corners, describes=describes))  # fmt: skip
     return text
+
+
+def outcome_text(state: Mapping[str, Any]) -> str:
+    """How the correlation of a snapshot or of a photograph ended, and why."""
+    return f"the correlation ended as “{state['outcome']}”: {state['outcome_why']}"
 
 
 def _lower(text: str) -> str:

@@ -25,6 +25,7 @@ from modeharvest.report.model import (
     Section,
     caption,
     number,
+    text_of,
     write_page,
 )
 from modeharvest.util.arrays import FloatArray
@@ -165,13 +166,21 @@ def _error_length(graded: Score) -> FloatArray:
     return np.hypot(graded.error_px[:, 0], graded.error_px[:, 1])
 
 
-def write_grading(folder: Path | str, grading: Grading) -> None:
-    """Write ``scores.json``, ``scores.csv`` and ``report.html``, each whole or not at all."""
-    folder = Path(folder)
-    write_json(folder / "scores.json", grading_summary(grading))
-    with atomic(folder / "scores.csv") as part:
-        part.write_text("\n".join(csv_lines(grading)) + "\n", "utf-8")
-    write_page(grading_report(grading), folder / "report.html")
+def write_grading(folder: Path | str, grading: Grading | StarGrading) -> None:
+    """Write a grading as JSON, CSV and ``report.html``, each whole or not at all.
+
+    The files are ``scores`` of displacement fields, and ``resolution`` of the star pattern.
+    """
+    if isinstance(grading, Grading):
+        path, report = Path(folder, "scores"), grading_report(grading)
+        numbers, lines = grading_summary(grading), csv_lines(grading)
+    else:
+        path, report = Path(folder, "resolution"), star_report(grading)
+        numbers, lines = star_summary(grading), star_csv_lines(grading.grades)
+    write_json(path.with_suffix(".json"), numbers)
+    with atomic(path.with_suffix(".csv")) as part:
+        part.write_text("\n".join(lines) + "\n", "utf-8")
+    write_page(report, path.with_name("report.html"))
 
 
 def grading_report(grading: Grading) -> Report:
@@ -181,37 +190,28 @@ def grading_report(grading: Grading) -> Report:
     frame, scale = maps.MapFrame.of(boundary, grading.truth.grid, _CELLS), length_scale(scores)
     drawn = [ErrorMaps(frame, graded) for graded in scores]
     several = len(scores) > 1
-    what = f"Displacement fields of {len(scores)} codes, ranked" if several else (
-        "A displacement field")  # fmt: skip
-    common = (
-        f"; “{COMMON}” is the {100 * grading.common_share:.0f} % of the material that every field "
-        "covers" if several else ""
-    )  # fmt: skip
+    what = text_of("scores-several" if several else "scores-one", count=len(scores))
+    common = text_of("scores-common", name=COMMON, share=100 * grading.common_share)
     return Report(
         kind="scores",
         title=f"Benchmark {grading.truth.id} at {100 * grading.strain:g} %",
-        lead=f"{what} against the truth of a set of images: the displacement of the finite "
-        "elements that the images were made of, at the very points that were returned.",
         keys=[
-            KeyNumber(f"{'Best: ' * several}{best.source}", number(best.everywhere.rms_px, 3),
-                      "px", "rms error per component"),
-            KeyNumber("95 % of its points", number(best.everywhere.percentiles_px[2], 3), "px",
-                      "have a smaller error"),
-            KeyNumber("Covered", f"{100 * best.covered:.1f}", "%",
-                      "of the material, within one spacing of a measured point"),
+            KeyNumber.of("score", first="Best: " * several, best=best),
+            KeyNumber.of("most-points", best=best),
+            KeyNumber.of("covered", f"{100 * best.covered:.1f}"),
         ],
         sections=[
-            Section.of("ranking", _ranking(grading), "scores", edge=grading.edge_px, common=common),
+            Section.of("ranking", _ranking(grading), "scores", edge=grading.edge_px,
+                       common=common if several else ""),
             Section.of("curves", _score_curves(grading), "score-curves"),
             Section.of("maps", [_score_maps(field, scale, n) for n, field in enumerate(drawn)],
                        "score-maps"),
         ],
         warnings=grading.notes,
-        command=f"modeharvest score FIELD … --truth DIR --strain {grading.strain} --out DIR",
-        remark="The numbers of this page are in scores.json and scores.csv beside it.",
         hero=ReportFigure("best", "Length of the best one’s error",
                           partial(drawn[0].draw_length, scale)),
         hero_caption=f"Length of the error of {best.source}.",
+        **caption("page-scores", what=what, strain=grading.strain),
     )  # fmt: skip
 
 
@@ -260,7 +260,7 @@ def _score_curves(grading: Grading) -> list[Card]:
     }
     if any(grading.spectra.values()):
         drawn["spectrum"] = partial(draw_spectra, grading.spectra)
-    return [Card.captioned(name, draw, f"score-{name}") for name, draw in drawn.items()]
+    return [Card.captioned(name, draw) for name, draw in drawn.items()]
 
 
 def _score_maps(drawn: ErrorMaps, scale: maps.ColourScale, n: int) -> Card:
@@ -363,38 +363,25 @@ def _round_values(low: float, high: float) -> list[float]:
     return [v for v in every if 0.3 * low <= v <= 3.0 * high]
 
 
-def write_star_grading(folder: Path | str, grading: StarGrading) -> None:
-    """Write ``resolution.json``, ``resolution.csv`` and ``report.html``, each whole or not."""
-    folder = Path(folder)
-    write_json(folder / "resolution.json", star_summary(grading))
-    with atomic(folder / "resolution.csv") as part:
-        part.write_text("\n".join(star_csv_lines(grading.grades)) + "\n", "utf-8")
-    write_page(star_report(grading), folder / "report.html")
-
-
 def star_report(grading: StarGrading) -> Report:
     """The report of codes that measured the star pattern."""
     grades, star = grading.grades, grading.star_set.spec.star
     rows = [grade_numbers(grade) for grade in grades]
     best, several = rows[0], len(rows) > 1
-    cells = [[f"{n}. {row['name']}", *(row[key] for key in GRADE_COLUMNS.values())]
+    cells = [[f"{n}. {row['name']}", *(row[key] for key in GRADE_COLUMNS)]
              for n, row in enumerate(rows, start=1)]  # fmt: skip
-    table = ReportTable("Ranking", ["code", *GRADE_COLUMNS], cells, on_terminal=True)
+    heads = ["code", *GRADE_COLUMNS.values()]
+    table = ReportTable("Ranking", heads, cells, on_terminal=True)
     words = caption(
         "page-resolution", amplitude=star.amplitude_px, shortest=number(star.shortest_px),
         longest=number(star.longest_px), id=grading.star_set.id,
     )  # fmt: skip
     return Report(
         kind="resolution",
-        title="Displacement resolution on the star pattern",
-        lead=words["lead"],
         keys=[
-            KeyNumber(f"{'Best: ' * several}{best['name']}", best["indicator_px2"], "px²",
-                      "indicator n l₁₀ %; the less, the better"),
-            KeyNumber("l₁₀ %", best["finest_px"], "px",
-                      "period at which 10 % of the amplitude is lost"),
-            KeyNumber("Noise floor n", best["noise_px"], "px",
-                      "standard deviation of v without motion"),
+            KeyNumber.of("indicator", first="Best: " * several, best=best),
+            KeyNumber.of("finest", best=best),
+            KeyNumber.of("noise-floor", best=best),
         ],
         sections=[
             Section.of("ranking", Card.tabular(table, wide=True), "resolution"),
@@ -403,8 +390,7 @@ def star_report(grading: StarGrading) -> Report:
                        "star-maps"),
         ],
         warnings=grading.notes,
-        command="modeharvest benchmark resolution FIELD … --still FIELD … --set DIR --out DIR",
-        remark=words["remark"],
+        **words,
     )  # fmt: skip
 
 
@@ -418,14 +404,11 @@ def _star_curves(grades: Sequence[StarGrade]) -> list[Card]:
 def _star_maps(grade: StarGrade, n: int) -> Card:
     down = np.where(grade.moved.good, -grade.moved.u[:, 1], np.nan)
     end = 1.2 * grade.star.amplitude_px
-    parts = {
-        "row": (
-            "Along the centre row",
-            partial(draw_centre_row, grade.attenuation, style.colour(n)),
-        ),
-        "v": ("v, down", partial(draw_map, grade, down, end)),
-        "error": ("Its error, down", partial(draw_map, grade, -grade.error_px[:, 1])),
-    }
-    figures = [ReportFigure(f"{key}-{n}", label, drawn, wide=True)
-               for key, (label, drawn) in parts.items()]  # fmt: skip
+    row = partial(draw_centre_row, grade.attenuation, style.colour(n))
+    error = partial(draw_map, grade, -grade.error_px[:, 1])
+    figures = [
+        ReportFigure(f"row-{n}", "Along the centre row", row, wide=True),
+        ReportFigure(f"v-{n}", "v, down", partial(draw_map, grade, down, end), wide=True),
+        ReportFigure(f"error-{n}", "Its error, down", error, wide=True),
+    ]
     return Card(f"{n + 1}. {grade.name}", figures, wide=True)

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from modeharvest.fem.bloch.modes import ModeSet
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import upward
 from modeharvest.report.figures import lattice as figures
 from modeharvest.report.figures.boundaries import LatticePatch
 from modeharvest.report.model import (
     Card,
-    Cell,
     KeyNumber,
     Mark,
     Report,
@@ -64,17 +64,16 @@ def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
     return Report(
         kind="lattice",
         title=summary["title"],
-        lead=caption("page-lattice")["lead"],
         findings=findings(summary),
         keys=key_numbers(summary),
         sections=[
             *([_pattern_section(run)] if run else []),
             Section.of("critical", _critical_cards(summary)),
             Section.of("dispersion", _dispersion_cards(summary, run)),
-            *([_mode_section(run)] if run else []),
+            *([_mode_section(run, run.modes)] if run and run.modes else []),
             Section.of("branches", _branch_cards(summary, run)),
-            *([Section.of("family", [_family_card(p) for p in run.patterns]), _study_section(run)]
-              if run else []),
+            Section.of("family", [_family_card(p) for p in run.patterns] if run else []),
+            *([_study_section(run.study)] if run and run.study else []),
         ],
         warnings=summary["notes"],
         notes=notes(summary),
@@ -85,7 +84,8 @@ def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
         versions=summary["versions"],
         hero=_hero(run) if run else None,
         hero_caption=text_of("lattice-hero", largest=DRAWN_AMPLITUDE) if summary["modes"] else "",
-    )  # fmt: skip
+        **caption("page-lattice"),
+    )
 
 
 def wave_name(wave: Wave | Sequence[float]) -> str:
@@ -135,20 +135,14 @@ def findings(summary: Summary) -> list[str]:
                             waves=waves_text(point), proof=proof(point)))  # fmt: skip
     elif point is not None:
         text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
-    text += [
-        text_of("lattice-zone", at=percent(part["load"]), wave=wave_name(part["wave"]),
-                 eigenvalue=number(part["eigenvalue"])) for part in summary["zone"]
-    ]  # fmt: skip
-    text += [
-        text_of("lattice-family", **family | {"waves": len(family["waves"]),
-                                               "captured": percent(family["captured"])})
-        for family in summary["families"]
-    ]  # fmt: skip
+    for part in summary["zone"]:
+        text.append(text_of("lattice-zone", name=wave_name(part["wave"]), **part))
+    for family in summary["families"]:
+        text.append(text_of("lattice-family", count=len(family["waves"]), **family))
     study = summary["study"]
     if study is not None:
-        low, high = study["overlap"]
-        count = f"{study['lattices']} lattice{'s' * (study['lattices'] != 1)}"
-        text.append(f"Study of {count}: overlap with the analytic mode {low:.4f} to {high:.4f}.")
+        plural = "s" * (study["lattices"] != 1)
+        text.append(text_of("lattice-study", plural=plural, **study))
     text.append(f"The lattice is of the {material_text(summary['case']['material'])}.")
     return text
 
@@ -157,41 +151,34 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
     """The few numbers at the top."""
     keys, point = [], summary["critical"]
     if point is not None:
-        load = f"{100 * point['load']:.4g}"
+        names = ["critical-load"] if point["found"] else ["stable-load", "lowest-filling"]
+        keys += [KeyNumber.of(name, load=100 * point["load"], point=point) for name in names]
         if point["found"]:
-            keys += [KeyNumber("critical strain", load, "%", point["loading"]),
-                     _waves_key(point, summary)]  # fmt: skip
-        else:
-            keys += [KeyNumber("stable up to", load, "%", point["loading"]),
-                     KeyNumber("lowest filling · λ/k²", point["value"], "MPa",
-                               "above zero")]  # fmt: skip
+            keys.append(_waves_key(point, summary))
         if point["found"] and point["long_wave_angle"] is None:
             change = f"{sum(point['below'])} → {sum(point['above'])}"
-            keys.append(KeyNumber("negative eigenvalues", change, "", "a millionth below → above"))
+            keys.append(KeyNumber.of("negative", change))
     if summary["families"]:
         family = summary["families"][0]
-        waves = len(family["waves"])
-        keys += [
-            KeyNumber("captured", f"{100 * family['captured']:.3g}", "%",
-                      f"of the energy of {family['of']}, by {waves} wave{'s' * (waves != 1)}"),
-            KeyNumber("mode family", str(family["parameters"]), "parameters", family["family"]),
-        ]  # fmt: skip
+        count = len(family["waves"])
+        values = {"share": 100 * family["captured"], "by": f"{count} wave{'s' * (count != 1)}"}
+        keys += [KeyNumber.of(name, **values, **family) for name in ("captured", "family")]
     stable = [b for b in summary["branches"]
               if b["states"] and b["states"][-1]["negative_eigenvalues"] == 0]  # fmt: skip
     if stable:
         low = min(stable, key=lambda b: _excess(b["states"][-1]))
-        remark = f"lowest energy at {percent(low['states'][-1]['load'])}"
-        keys.append(KeyNumber("stable branch", combination_name(low["combination"]), "", remark))
+        name = combination_name(low["combination"])
+        keys.append(KeyNumber.of("stable-branch", name, **low["states"][-1]))
     return keys
 
 
 def _waves_key(point: Mapping[str, Any], summary: Summary) -> KeyNumber:
-    copies = (summary["modes"] or {}).get("copies")
-    remark = f"repeat after {copies[0]} × {copies[1]} cells" if copies else "phases (k·a₁, k·a₂)"
+    text, copies = waves_text(point), (summary["modes"] or {}).get("copies")
     if len(point["waves"]) > 1:
-        return KeyNumber("critical waves", str(len(point["waves"])), "at once", waves_text(point))
-    is_long = point["long_wave_angle"] is not None
-    return KeyNumber("critical wave", "long" if is_long else waves_text(point), "", remark)
+        return KeyNumber.of("critical-waves", str(len(point["waves"])), waves=text)
+    value = text if point["long_wave_angle"] is None else "long"
+    key = "copied-wave" if copies else "critical-wave"
+    return KeyNumber.of(key, value, copies=copies)
 
 
 def _excess(state: Mapping[str, Any]) -> float:
@@ -203,8 +190,7 @@ def notes(summary: Summary) -> list[str]:
     """What a reader should know before trusting the numbers, drawn from the data."""
     text, point = [], summary["critical"]
     if point is not None and not point["found"]:
-        text.append(text_of("lattice-no-proof", loading=point["loading"],
-                             load=percent(point["load"]), outcome=summary["outcome"]))  # fmt: skip
+        text.append(text_of("lattice-no-proof", outcome=summary["outcome"], point=point))
     elif point is not None and point["long_wave_angle"] is not None:
         text.append(text_of("lattice-long-waves", loading=point["loading"]))
     if any(branch["states"] for branch in summary["branches"]):
@@ -284,22 +270,19 @@ def _critical_cards(summary: Summary) -> list[Card]:
     if point is None:
         return []
     mark = Mark("critical", True) if point["found"] else Mark("stable so far", False)
-    row = (point["loading"], f"{100 * point['load']:.5g}", waves_text(point), mark, proof(point))
-    columns = ("loading", "strain [%]", "critical waves", "", "proof")
-    table = ReportTable("Critical point", columns, [row])
-    return Card.tabular(table, wide=True)
+    row = {"loading": point["loading"], "strain": f"{100 * point['load']:.5g}",
+           "waves": waves_text(point), "found": mark, "proof": proof(point)}  # fmt: skip
+    return Card.tabular(ReportTable.of("critical", [row]), wide=True)
 
 
 def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
     rows = summary["dispersion"]
     if not rows:
         return []
-    names = dict.fromkeys(name for name, _ in rows[0]["corners"] if name != "Γ")
-    table = ReportTable(
-        "Lowest eigenvalue [N/mm⁴]", ("wave", *(percent(row["load"]) for row in rows)),
-        [(name, *(dict(row["corners"])[name] for row in rows)) for name in names],
-        on_terminal=True,
-    )  # fmt: skip
+    names = {name: name for name, _ in rows[0]["corners"] if name != "Γ"}
+    loads = [(percent(row["load"]), dict(row["corners"])) for row in rows]
+    table = ReportTable.of_states("Lowest eigenvalue [N/mm⁴]", "wave", names, loads,
+                                  on_terminal=True)  # fmt: skip
     corners = Card.tabular(table)
     if run is None or run.dispersion is None:
         return corners
@@ -314,11 +297,8 @@ def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
     return [*(card for card in cards if card.figures), *corners]
 
 
-def _mode_section(run: LatticeRun) -> Section:
+def _mode_section(run: LatticeRun, modes: ModeSet) -> Section:
     """Every mode of the set upon the undeformed lattice."""
-    modes = run.modes
-    if modes is None:
-        return Section("modes", "Modes", [])
     still, drawn = _window(run), []
     for k, (wave, value) in enumerate(zip(modes.waves, modes.eigenvalues, strict=True)):
         shape = modes.shapes[k]
@@ -335,25 +315,21 @@ def _mode_section(run: LatticeRun) -> Section:
 
 
 def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
-    rows = [_branch_row(branch) for branch in summary["branches"]]
-    if not rows:
-        return []
-    columns = ("branch", "last strain [%]", "energy − primary [kPa]", "negative eigenvalues",
-               "amplitudes [mm]", "outcome")  # fmt: skip
-    table = ReportTable("Branches at their last states", columns, rows, on_terminal=True)
+    table = ReportTable.of("branches", map(_last_state, summary["branches"]))
     return [*(_branch_figures(run) if run else []), *Card.tabular(table, wide=True)]
 
 
-def _branch_row(branch: Mapping[str, Any]) -> tuple[Cell, ...]:
-    name = combination_name(branch["combination"])
+def _last_state(branch: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A branch's row in the table."""
+    named = {"name": combination_name(branch["combination"]), "outcome": branch["outcome"]}
     if not branch["states"]:
-        return (name, None, None, None, "–", branch["outcome"])
+        return named | {"amplitudes": "–"}
     state = branch["states"][-1]
     sizes = np.array(state["amplitudes"])
     sizes = np.where(np.abs(sizes) > 1e-6 * np.abs(sizes).max(), sizes, 0.0)
     amplitudes = ", ".join(number(float(a)) for a in sizes)
-    return (name, f"{100 * state['load']:.4g}", _excess(state), state["negative_eigenvalues"],
-            amplitudes, branch["outcome"])  # fmt: skip
+    shown = {"strain": f"{100 * state['load']:.4g}", "excess": _excess(state)}
+    return {**state, **named, **shown, "amplitudes": amplitudes}
 
 
 def _branch_figures(run: LatticeRun) -> list[Card]:
@@ -372,33 +348,25 @@ def _branch_figures(run: LatticeRun) -> list[Card]:
 
 def _family_card(found: FoundPattern) -> Card:
     family = found.family
-    rows: list[tuple[Cell, ...]] = [
-        (k, *(fixed(float(v)) for v in wave)) for k, wave in enumerate(family.waves, start=1)
-    ]
-    table = ReportTable(f"Waves of {found.name}", ("wave", "A", "B", "kₓ", "k_y", "c [mm]"), rows)
+    rows = [{"wave": k, **dict(zip("ABxyc", map(fixed, map(float, wave)), strict=True))}
+            for k, wave in enumerate(family.waves, start=1)]  # fmt: skip
     guess = ", ".join(
         f"{name} = {number(round(float(value), 5))}"
         for name, value in zip(family.family.names, family.family.start, strict=True)
     )
     growth = ", ".join(f"{count}: {percent(share)}" for count, share in family.growth)
-    caption = (
-        f"Initial parameters: {guess}. Energy captured by 1, 2, … independent waves: {growth}."
-    )
-    return Card(found.name, tables=[table], text=family.text, caption=caption,
-                paper=family.family.name, wide=True)  # fmt: skip
+    words = text_of("lattice-waves", guess=guess, growth=growth)
+    return Card(found.name, tables=[ReportTable.of("family", rows, of=found.name)],
+                text=family.text, caption=words, paper=family.family.name, wide=True)  # fmt: skip
 
 
-def _study_section(run: LatticeRun) -> Section:
+def _study_section(study: LatticeModeStudy) -> Section:
     """Curves, overlays and rows of a study."""
-    study = run.study
-    if study is None:
-        return Section("study", "Parameter study", [])
     overlays = [_overlay(mode, n) for n, mode in enumerate(study.overlays, start=1)]
-    tables = [
-        ReportTable(f"{name}: every value", _STUDY_COLUMNS, study_rows(rows), folded=True)
-        for name, rows in (("Hole size and loading", study.ratios), ("Cell size", study.scales),
-                           ("Material", study.materials)) if rows
-    ]  # fmt: skip
+    series = {"Hole size and loading": study.ratios, "Cell size": study.scales,
+              "Material": study.materials}  # fmt: skip
+    tables = [ReportTable.of("study", map(_study_row, rows), of=name)
+              for name, rows in series.items() if rows]  # fmt: skip
     drawn = {"strains": figures.draw_critical_strains, "overlaps": figures.draw_overlaps,
              "captured": figures.draw_captured} if study.ratios else {}  # fmt: skip
     cards = [
@@ -416,27 +384,22 @@ def _overlay(mode: PatternMode, n: int) -> ReportFigure:
     size = min(DRAWN_AMPLITUDE, 0.4 * row.ratio)
     drawn = partial(figures.draw_overlay, mode.mesh, row.pitch, mode.shape, mode.analytic,
                     size * row.pitch)  # fmt: skip
-    text = f"overlap {row.overlap:.4f}; largest displacement {size:.3g} l; {row.loading}, state at "
-    text += percent(row.state) + ("" if row.is_first else ", where it is not critical")
+    text = text_of("lattice-overlay", row=row, size=size)
+    text += "" if row.is_first else ", where it is not critical"
     return ReportFigure(f"overlay-{n}", f"d/l = {row.ratio:.4g}", drawn, text)
 
 
-_STUDY_COLUMNS = (
-    "material", "loading", "l [mm]", "d/l", "first critical", "first waves", "(π, π) critical",
-    "overlap with Eq. (mode)", "captured (waves)", "overlap with reference",
-)  # fmt: skip
-
-
-def study_rows(rows: Sequence[ModeRow]) -> list[tuple[Cell, ...]]:
-    """Rows of the study's tables."""
-    return [
-        (row.material, row.loading, row.pitch, row.ratio,
-         percent(row.first) if row.found else f"> {percent(row.first)}",
-         Mark(_KINDS[row.kind], True) if row.is_first else _KINDS[row.kind],
-         percent(row.pattern), f"{row.overlap:.4f}", f"{percent(row.captured)} ({row.waves})",
-         None if math.isnan(row.likeness) else f"{row.likeness:.6f}")
-        for row in rows
-    ]  # fmt: skip
+def _study_row(row: ModeRow) -> Mapping[str, Any]:
+    """A row of the study's tables."""
+    kind = _KINDS[row.kind]
+    return vars(row) | {
+        "first": percent(row.first) if row.found else f"> {percent(row.first)}",
+        "kind": Mark(kind, True) if row.is_first else kind,
+        "pattern": percent(row.pattern),
+        "overlap": f"{row.overlap:.4f}",
+        "captured": f"{percent(row.captured)} ({row.waves})",
+        "likeness": None if math.isnan(row.likeness) else f"{row.likeness:.6f}",
+    }
 
 
 def study_text(study: LatticeModeStudy) -> list[str]:
@@ -454,15 +417,10 @@ def study_text(study: LatticeModeStudy) -> list[str]:
         best = max(study.ratios, key=lambda row: row.overlap)
         worst = min(study.ratios, key=lambda row: row.overlap)
         text.append(text_of("lattice-overlap", worst=worst, best=best))
-    text += _likeness_text(study.scales, "cell sizes", " (1 to rounding by construction: equations "
-                           "and mesh scale, only rounding differs)")  # fmt: skip
-    return text + _likeness_text(study.materials, "materials", "")
-
-
-def _likeness_text(rows: Sequence[ModeRow], what: str, remark: str) -> list[str]:
-    known = [row.likeness for row in rows if not math.isnan(row.likeness)]
-    if not known:
-        return []
-    least = min(known)
-    value = f"1 − {number(1 - least)}" if 0 < 1 - least < 1e-4 else f"{least:.6g}"
-    return [f"Modes of other {what} overlap with the reference's by at least {value}{remark}."]
+    for what, others in {"scales": study.scales, "materials": study.materials}.items():
+        known = [row.likeness for row in others if not math.isnan(row.likeness)]
+        if known:
+            least = min(known)
+            value = f"1 − {number(1 - least)}" if 0 < 1 - least < 1e-4 else f"{least:.6g}"
+            text.append(text_of(f"lattice-{what}", value=value))
+    return text

@@ -14,13 +14,14 @@ from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
 from modeharvest.report.model import (
     Card,
-    Cell,
     KeyNumber,
     Report,
     ReportFigure,
     ReportTable,
     Section,
+    caption,
     number,
+    text_of,
 )
 from modeharvest.util.arrays import FloatArray
 
@@ -30,12 +31,6 @@ Residual = Callable[[str, NodalResult], FloatArray]
 
 _SHOWN = 4
 """Images with maps of their own, at most: the last ones are spread evenly over the sequence."""
-_COLUMNS = {
-    "rms_px": "u, rms [px]", "max_px": "u, largest [px]", "median_sd_px": "sd, median [px]",
-    "cutoff_px": "cut-off wavelength [px]", "unknowns": "unknowns", "pixels": "pixels",
-    "residual_rms": "residual [levels]", "residual_noise": "of it noise [levels]",
-    "gain": "gain", "library": "factorised by",
-}  # fmt: skip
 
 
 def measure_report(
@@ -49,8 +44,7 @@ def measure_report(
     their ``residual``; without, the report has numbers only, as for the terminal.
     """
     images = summary["images"]
-    rows: list[list[Cell]] = [[i["name"], *(i[key] for key in _COLUMNS)] for i in images]
-    table = ReportTable("Images", ["image", *_COLUMNS.values()], rows, "images", on_terminal=True)
+    table = ReportTable.of("images", images)
     names = [image["name"] for image in images]
     shown = np.unique(np.linspace(len(names) - 1, 0, min(_SHOWN, len(names))).round().astype(int))
     maps = [
@@ -61,32 +55,24 @@ def measure_report(
     return Report(
         kind="measurement",
         title=summary["title"],
-        lead="The displacement of a speckled surface by finite-element digital image correlation, "
-        "up to the edges of the material, with standard deviations that count noise and smoothing.",
-        findings=[
-            f"{last['name']}: u is {number(last['rms_px'])} px rms per component, at most "
-            f"{number(last['max_px'])} px, known to {number(last['median_sd_px'], 2)} px; "
-            f"waves shorter than {number(last['cutoff_px'], 3)} px are smoothed away."
-        ],
+        findings=[text_of("measure-found", last=last)],
         keys=[
-            KeyNumber("largest displacement", number(last["max_px"], 4), "px", last["name"]),
-            KeyNumber("standard deviation", number(last["median_sd_px"], 2), "px", "median"),
-            KeyNumber("cut-off wavelength", number(last["cutoff_px"], 3), "px"),
-            KeyNumber("coverage", number(100 * last["coverage"], 4), "%", "of the material"),
+            KeyNumber.of("largest-displacement", last=last),
+            KeyNumber.of("standard-deviation", last=last),
+            KeyNumber.of("cutoff", last=last),
+            KeyNumber.of("coverage-of-material", number(100 * last["coverage"], 4)),
         ],
-        sections=[*maps, Section("numbers", "Numbers", Card.tabular(table, wide=True))],
+        sections=[*maps, Section.of("numbers", Card.tabular(table, wide=True))],
         warnings=[
             *summary["warnings"],
             *(f"{i['name']}: {text}" for i in images for text in i["warnings"]),
         ],
         notes=[
-            f"The mask of the material was {summary['mask']}: mask.tif.",
-            f"Lengths in all files are in {summary['unit']}, from the middle of the image, x right "
-            "and y up.",
+            text_of("measure-mask", **summary),
+            text_of("measure-unit", **summary),
             *summary["notes"],
         ],
         command=summary["command"],
-        remark="Run it again after an interruption: finished images are not measured again.",
         files={
             "results/*.h5": "nodes, displacement, standard deviations (HDF5)",
             "results/*.vtu": "the same with strains, for ParaView",
@@ -94,7 +80,8 @@ def measure_report(
             "results/*.tif": "u, v and their standard deviations at every pixel (float32)",
         },
         versions=summary["versions"],
-    )
+        **caption("page-measure"),
+    )  # fmt: skip
 
 
 def _cards(

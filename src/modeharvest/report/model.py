@@ -9,11 +9,12 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from math import isfinite
 from pathlib import Path
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
@@ -31,19 +32,42 @@ NBSP = "\N{NO-BREAK SPACE}"
 
 
 @cache
-def _captions() -> dict[str, dict[str, str]]:
+def _captions() -> dict[str, dict[str, Any]]:
     source = resources.files(__package__).joinpath("captions.toml")
     return tomllib.loads(source.read_text("utf-8"))
 
 
 def caption(name: str, **values: object) -> dict[str, Any]:
     """Title, caption, lead … of that name in ``captions.toml``, with values filled in."""
-    return {key: Markup(text).format(**values) for key, text in _captions()[name].items()}
+    words = _captions()[name].items()
+    return {k: Markup(v).format(**values) if isinstance(v, str) else v for k, v in words}
+
+
+@dataclass(frozen=True)
+class _Readable:
+    """A value that is filled in as a function writes it, with so many digits if some are given."""
+
+    written: Callable[..., str]
+    value: Any
+
+    def __format__(self, digits: str) -> str:
+        return self.written(self.value, *map(int, digits.split()))
+
+
+class _Template(Formatter):
+    """Fills values into plain text: ``{x!n:3}`` as :func:`number`, ``{x!p}`` as :func:`percent`."""
+
+    def convert_field(self, value: Any, conversion: Any) -> Any:
+        """A field's value as its conversion says."""
+        ways: dict[str, Callable[..., str]] = {"n": number, "p": percent}
+        if conversion in ways:
+            return _Readable(ways[conversion], value)
+        return super().convert_field(value, conversion)
 
 
 def text_of(name: str, /, **values: object) -> str:
     """The text of that name in ``captions.toml``, plain text, with values filled in."""
-    return _captions()["text"][name].format(**values)
+    return _Template().vformat(_captions()["text"][name], (), values)
 
 
 @dataclass(frozen=True)
@@ -91,6 +115,16 @@ class KeyNumber:
     remark: str = ""
     """What to compare it with."""
 
+    @classmethod
+    def of(cls, name: str, value: str | float | None = None, /, **values: object) -> KeyNumber:
+        """The one of that name in ``captions.toml``, with values filled in.
+
+        Its own ``value`` is given where it is not among the words.
+        """
+        words = _captions()["key"][name].items()
+        filled: dict[str, Any] = {k: _Template().vformat(v, (), values) for k, v in words}
+        return cls(**{"value": value, **filled})
+
 
 @dataclass(frozen=True, eq=False)
 class ReportFigure:
@@ -130,12 +164,39 @@ class ReportTable:
     on_terminal: bool = False
 
     @classmethod
-    def of(cls, title: str, table: pd.DataFrame, **more: Any) -> ReportTable:
+    def of(
+        cls, name: str, records: Iterable[Mapping[str, Any]], /, **values: object
+    ) -> ReportTable:
+        """The table named ``table-name`` in ``captions.toml``: its columns of these records."""
+        words = _captions()[f"table-{name}"]
+        heads, title = words["columns"], words["title"].format(**values)
+        rows = [[record.get(key) for key in heads] for record in records]
+        return cls(**{**words, "title": title, "columns": list(heads.values()), "rows": rows})
+
+    @classmethod
+    def of_states(
+        cls,
+        title: str,
+        corner: str,
+        heads: Mapping[str, str],
+        states: Sequence[tuple[str, Mapping[str, Any]]],
+        **more: Any,
+    ) -> ReportTable:
+        """A column for each of some labelled states, a row for each quantity that one has.
+
+        ``corner``: above the quantities, whose headings are ``heads``.
+        """
+        rows = [[head, *(state.get(key) for _, state in states)] for key, head in heads.items()]
+        rows = [row for row in rows if any(value is not None for value in row[1:])]
+        return cls(title, [corner, *(label for label, _ in states)], rows, **more)
+
+    @classmethod
+    def of_frame(cls, title: str, table: pd.DataFrame) -> ReportTable:
         """A data frame as it is, with a CSV file."""
         rows = table.astype(object).values.tolist()
         columns = [str(column) for column in table]
         name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
-        return cls(title, columns, rows, f"table-{name}", f"{name}.csv", **more)
+        return cls(title, columns, rows, f"table-{name}", f"{name}.csv")
 
     @property
     def numeric(self) -> list[bool]:
@@ -164,17 +225,9 @@ class Card:
     """Whether it takes the whole width of the page."""
 
     @classmethod
-    def captioned(
-        cls,
-        name: str,
-        draw: Callable[[], Figure],
-        text: str = "",
-        wide: bool = False,
-        **values: object,
-    ) -> Card:
-        """One figure over the whole width, with the words named ``text``, or as the figure."""
-        figure = ReportFigure(name, "", draw, wide=True)
-        return cls(**caption(text or name, **values), figures=[figure], wide=wide)
+    def captioned(cls, name: str, draw: Callable[[], Figure], **values: object) -> Card:
+        """One figure over the whole width, with the words of its name."""
+        return cls(**caption(name, **values), figures=[ReportFigure(name, "", draw, wide=True)])
 
     @classmethod
     def tabular(cls, table: ReportTable, **more: Any) -> list[Card]:
@@ -259,9 +312,11 @@ class Findings:
     """The same in sentences, the most important first."""
     keys: Sequence[KeyNumber] = ()
     """Up to six numbers to begin with."""
-    figures: Sequence[Card] = ()
+    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+    words: Mapping[str, object] = field(default_factory=dict)
+    """By their names; values in their captions, which are named by study and figure."""
     tables: Sequence[ReportTable] = ()
-    """Both of the page."""
+    """Of the page."""
     attachments: Sequence[ReportTable] = ()
     """Tables that are files only: too long for the page, or one of its tables in numbers."""
 
@@ -280,9 +335,10 @@ def study_report(
     found = findings or Findings({}, ())
     made = f"{summary['command']} · {summary['seeds']}"
     figures = [
-        replace(card, figures=[replace(figure, numbers=made) for figure in card.figures])
-        for card in found.figures
-    ]
+        Card(figures=[ReportFigure(name, "", draw, made, wide=True)],
+             **caption(f"{summary['kind']}-{name}", **found.words))
+        for name, draw in found.figures.items()
+    ]  # fmt: skip
     return Report(
         kind="study",
         title=summary["title"],
@@ -290,10 +346,8 @@ def study_report(
         findings=summary["text"],
         keys=found.keys,
         sections=[
-            Section("figures", "Figures", figures),
-            Section("tables", "Tables",
-                    [card for t in found.tables for card in Card.tabular(t, wide=True)],
-                    "Every case is a row of table.csv."),
+            Section.of("figures", figures),
+            Section.of("tables", [c for t in found.tables for c in Card.tabular(t, wide=True)]),
         ],
         warnings=[f"case {case['file']} failed: {case['error']}" for case in summary["failed"]],
         notes=_study_notes(summary),

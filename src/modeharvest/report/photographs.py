@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from markupsafe import Markup
 
-from modeharvest.report.experiment import verdict
+from modeharvest.report.experiment import expected_cards, outcome_text
 from modeharvest.report.figures import fits
 from modeharvest.report.figures import photographs as figures
 from modeharvest.report.figures.curves import draw_onset, draw_waves
@@ -52,32 +53,32 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
     names = photograph_labels(shown)
     states = figures.photograph_states(harvest, names) if harvest else []
     buckling = summary.get("buckling") or {}
-    sections = fits.panel_sections(
+    panels = fits.panel_sections(
         _PANELED, photograph_panels(states), states,
         lambda key, s: panel_numbers(key, frames[s.frame.name]) or fits.shape_numbers(key, s),
         known="These photographs were made by a simulation, so the truth is known. ",
         source="Fig. “real” of the paper. ", pattern=Markup("v<sub>1</sub>φ<sub>1</sub>"),
     )  # fmt: skip
-    sections = [section for section in sections if section.cards or section.name != "whole"]
+    drawn: list[Section] = []
+    if harvest:
+        text = {names[f["name"]]: [*f["pattern_reading"], *f["start"]] for f in shown}
+        readings = Card(text=text, name="reading", wide=True, **caption("readings"))
+        panels[0] = replace(panels[0], cards=[*panels[0].cards, readings])
+        drawn = [_reference(harvest, summary, states), _optics(harvest, summary), *panels]
     steps = [fits.convergence_card(s, frames[s.frame.name]["outcome_why"]) for s in states]
-    last, hero = summary["frames"][-1], None
-    if states:
-        drawn = partial(figures.draw_hero, states[-1])
-        hero = ReportFigure("hero", "The last photograph", drawn)
+    last = summary["frames"][-1]
+    state = photograph_label(last).lower()
     return Report(
         kind="photographs",
         title=summary["title"],
-        lead=caption("page-photographs")["lead"],
         findings=[buckling["text"]] if buckling.get("text") else [],
         keys=key_numbers(summary),
         sections=[
-            *([_reference(harvest, summary, states)] if harvest else []),
-            *([_optics(harvest, summary)] if harvest and harvest.optics.distortion else []),
-            *(_with_readings(sections, shown, names) if states else []),
-            Section("truth", "Obtained and expected values", _truth_cards(summary)),
+            *drawn,
+            Section.of("truth", expected_cards("truth", summary.get("truth") or []), "expected"),
             *([_timeline(harvest, summary)] if harvest else []),
-            Section("numbers", "Numbers", number_cards(summary, shown, names)),
-            Section("convergence", "Convergence", steps),
+            Section.of("numbers", number_cards(summary, shown, names)),
+            Section.of("convergence", steps),
         ],
         warnings=[
             *(f"not used: {row['name']}: {row['reason']}" for row in summary.get("skipped", [])),
@@ -89,9 +90,10 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         toml=harvest.toml if harvest else "",
         case=summary["experiment"],
         versions=summary["versions"],
-        hero=hero,
-        hero_caption=text_of("photographs-hero", name=last["name"],
-                             state=photograph_label(last).lower()),
+        hero=ReportFigure("hero", "The last photograph", partial(figures.draw_hero, states[-1]))
+        if states else None,
+        hero_caption=text_of("photographs-hero", name=last["name"], state=state),
+        **caption("page-photographs"),
     )  # fmt: skip
 
 
@@ -113,11 +115,10 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
     """The few numbers at the top."""
     last, rows = summary["frames"][-1], summary["truth"]
     used, left = len(summary["frames"]), len(summary["skipped"])
-    remark = f"{left} of them left out, see below" if left else "all of them"
-    first = KeyNumber("photographs used", f"{used} of {used + left}", "", remark)
+    count, key = f"{used} of {used + left}", "some-used" if left else "all-used"
+    first = KeyNumber.of(key, count, left=left)
     if rows:
-        met = f"{sum(row['ok'] for row in rows)} of {len(rows)}"
-        first = KeyNumber("within the specified error", met, "", "table below")
+        first = KeyNumber.of("truth", f"{sum(row['ok'] for row in rows)} of {len(rows)}")
     modes = _mode_keys(last) if last["modes"] else []
     return [first, _buckling(summary), *modes, _model_error_key(last)]
 
@@ -125,14 +126,12 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
 def _buckling(summary: Summary) -> KeyNumber:
     found = summary["buckling"]
     if found is None or found["after"] is None:
-        return KeyNumber("buckling", None, "", "no pattern that stands out")
+        return KeyNumber.of("no-buckling", None)
+    after = f"{100 * found['after']:.4g}"
     if found["before"] is None:
-        return KeyNumber("buckling", f"< {100 * found['after']:.4g}", "%", "all show the pattern")
-    span = f"{100 * found['before']:.4g} … {100 * found['after']:.4g}"
-    remark = "the pattern appears between these strains"
-    if found["estimate"] is not None:
-        remark = f"its growth extrapolates to {percent(found['estimate'])}"
-    return KeyNumber("buckling", span, "%", remark)
+        return KeyNumber.of("all-buckled", f"< {after}")
+    key = "buckling" if found["estimate"] is None else "buckling-estimate"
+    return KeyNumber.of(key, f"{100 * found['before']:.4g} … {after}", **found)
 
 
 def _mode_keys(frame: Frame) -> list[KeyNumber]:
@@ -143,9 +142,9 @@ def _mode_keys(frame: Frame) -> list[KeyNumber]:
     largest = max((sd for sd in known if sd is not None), default=float("nan"))
     sd = "fixed" if mode["fixed"] else f"± {number(largest, 1)}"
     return [
-        KeyNumber("pattern", number(mode["largest_px"], 3), "px", f"largest v₁φ₁ {at}"),
-        KeyNumber("largest v₁", _micro(mode["v_max_mm"], 4), "µm", f"± {_two_errors(mode)} µm"),
-        KeyNumber("wave vector ξ", f"({xi})", "1/l", f"{sd}; the first of {count}"),
+        KeyNumber.of("pattern", number(mode["largest_px"], 3), symbol="v₁φ₁", at=at),
+        KeyNumber.of("amplitude", _micro(mode["v_max_mm"], 4), sd=_two_errors(mode)),
+        KeyNumber.of("wave", f"({xi})", sd=sd, count=count),
     ]
 
 
@@ -164,14 +163,12 @@ def _micro(millimetres: float | None, digits: int = 2) -> str:
 
 def _model_error_key(frame: Frame) -> KeyNumber:
     local, whole = frame["local"], frame["whole_field"]
+    name = "estimated-w"
     if whole is not None:
-        remark = "rms of whole displacement − IDIC"
-        return KeyNumber("model error w", number(whole["w_rms_px"], 2), "px", remark)
-    if local is not None and local["w_beyond_noise_px"] is not None:
-        remark = f"rms of local DIC − IDIC beyond the local DIC’s {local['sd_px']:.2g} px"
-        return KeyNumber("model error w", number(local["w_beyond_noise_px"], 2), "px", remark)
-    remark = "rms, estimated from the residual"
-    return KeyNumber("model error w", number(frame["model_error_px"], 2), "px", remark)
+        name = "whole-w"
+    elif local is not None and local["w_beyond_noise_px"] is not None:
+        name = "local-w"
+    return KeyNumber.of(name, **frame)
 
 
 def panel_numbers(key: str, frame: Frame) -> str:
@@ -180,15 +177,12 @@ def panel_numbers(key: str, frame: Frame) -> str:
     if key.startswith("whole-"):
         return whole_panel_numbers(key, frame["whole_field"])
     if key == "image":
-        return f"{frame['name']}; compression {percent(frame['strain_x'])} along x, " + (
-            f"{percent(frame['strain_y'])} along y"
-        )
+        return text_of("photographs-image", frame=frame)
     if key == "residual":
         return _residual_numbers(frame)
     if key == "w" and local is not None:
-        text = f"rms {local['w_rms_px']:.3g} px per component at {local['points']} points"
-        if local["sd_px"] is not None:
-            text += f", of which the local DIC’s own error {local['sd_px']:.2g} px"
+        text = text_of("photographs-local", **local)
+        text += "" if local["sd_px"] is None else text_of("photographs-local-sd", **local)
         return text + (f"; {local['lost']} points lost" if local["lost"] else "")
     field, _, cause = key.partition("-")
     errors = frame["errors_px"]["noise" if cause == "noise" else "model_error"] if cause else None
@@ -199,76 +193,48 @@ def panel_numbers(key: str, frame: Frame) -> str:
 
 
 def _residual_numbers(frame: Frame) -> str:
-    share, chi = frame["residual_of_full_scale"], frame["chi_square"]
-    text = f"rms {number(frame['residual_rms'])} grey levels"
-    if share is not None:
-        text += f", {percent(share, 2)} of full scale"
-    return text + ("" if chi is None else f"; χ² {chi:.3g}")
+    names = ("residual_rms", "residual_of_full_scale", "chi_square")
+    known = [name for name in names if frame[name] is not None]
+    return "".join(text_of(f"photographs-{name}", **frame) for name in known)
 
 
 def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[PhotographState]]:
     """Every quantity that is drawn of one of these photographs."""
     modes = max((len(state.frame.modes) for state in states), default=0)
     parts = states[0].frame.parts if states else ()
+    fields = [("v0", 0), *((name, i) for i in range(modes) for name in ("v", "fluc"))]
 
     def has_spectrum(state: PhotographState) -> bool:
         return state.frame.spectrum is not None
 
+    def has_local(state: PhotographState) -> bool:
+        return state.frame.local is not None
+
     def is_known(state: PhotographState) -> bool:
         return figures.truth_of(state) is not None
 
-    last = "residual-and-model-error"
+    last, Panel = "residual-and-model-error", fits.Panel[PhotographState]
     panels: list[fits.Panel[PhotographState]] = [
-        fits.Panel.of("photographs", "image", figures.draw_deformed, text="photograph"),
-        fits.Panel.of("photographs", "closeup", figures.draw_closeup, cells=figures.CLOSE),
+        Panel("photographs", "image", figures.draw_deformed, text="photograph"),
+        Panel("photographs", "closeup", figures.draw_closeup, values={"cells": figures.CLOSE}),
         *fits.spectrum_panels("photographs", "spect_real", "photographs", has_spectrum),
-        *(fits.Panel.of("photographs", f"S{axis}{axis}-part{k + 1}",
-                   partial(figures.draw_part_spectrum, part=k, component=c), text=f"part-{axis}",
-                   part=part.name)
+        *(Panel("photographs", f"S{axis}{axis}-part{k + 1}",
+                partial(figures.draw_part_spectrum, part=k, component=c), text=f"part-{axis}",
+                values={"part": part.name})
           for k, part in enumerate(parts) for c, axis in enumerate("xy")),
         *fits.ansatz_panels("found", "real", modes),
         *figures.WHOLE_MAPS.panels(),
-        fits.Panel.of(last, "residual", figures.draw_residual, text="photograph-residual",
-                      exact=True),
-        fits.Panel.of(last, "w", figures.draw_w, lambda state: state.frame.local is not None,
-                      "photograph-w"),
-        *_error_panels("v0", "v0"),
+        Panel(last, "residual", figures.draw_residual, text="photograph-residual", exact=True),
+        Panel(last, "w", figures.draw_w, has_local, "photograph-w"),
+        *(Panel("uncertainty", f"{name}{'' if name == 'v0' else i + 1}-{cause}",
+                partial(figures.draw_error, name=name, i=i, cause=cause),
+                partial(figures.has_error, name=name, i=i, cause=cause), f"{name}-{cause}",
+                values={"n": i + 1})
+          for name, i in fields for cause in ("noise", "model")),
+        *(Panel("errors", part, partial(figures.draw_error_against_truth, part=part), is_known,
+                part.replace("_", "-")) for part in ("true_w", "best", "loss")),
     ]  # fmt: skip
-    for i in range(modes):
-        panels += [*_error_panels(f"v{i + 1}", "v", i), *_error_panels(f"fluc{i + 1}", "fluc", i)]
-    for part, text in {"true_w": "true-w", "best": "best", "loss": "loss"}.items():
-        drawn = partial(figures.draw_error_against_truth, part=part)
-        panels.append(fits.Panel.of("errors", part, drawn, is_known, text))
     return [panel for panel in panels if any(map(panel.shows, states))]
-
-
-def _error_panels(field: str, text: str, i: int | None = None) -> list[fits.Panel[PhotographState]]:
-    """Standard deviations of a field by both causes."""
-
-    def shows(state: PhotographState) -> bool:
-        return i is None or fits.has_mode(i)(state)
-
-    def shows_model(state: PhotographState) -> bool:
-        return state.frame.by_model_error is not None and shows(state)
-
-    causes: dict[figures.Cause, Callable[[PhotographState], bool]]
-    causes = {"noise": shows, "model": shows_model}
-    return [
-        fits.Panel.of("uncertainty", f"{field}-{cause}",
-                 partial(figures.draw_error, field=field, cause=cause), shown, f"{text}-{cause}",
-                 n=(i or 0) + 1)
-        for cause, shown in causes.items()
-    ]  # fmt: skip
-
-
-def _with_readings(
-    sections: Sequence[Section], shown: Sequence[Frame], names: Mapping[str, str]
-) -> Sequence[Section]:
-    """The first section with what is read off the densities, and the initial guesses."""
-    first, *others = sections
-    text = {names[f["name"]]: [*f["pattern_reading"], *f["start"]] for f in shown}
-    card = Card("Reading of the densities, and initial guess", text=text, name="reading", wide=True)
-    return [Section(first.name, first.title, [*first.cards, card], first.lead), *others]
 
 
 def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographState]) -> Section:
@@ -295,19 +261,17 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
     drawn = partial(figures.draw_reference, harvest, states[0].view.boundary, states[0].levels)
     figure = ReportFigure("reference", "The reference", drawn, wide=True)
     table = ReportTable("Reference", ("", ""), rows)
-    title = "Material, holes, lattice and the part with holes"
-    cards = [Card(title, [figure], [table], [*text, *summary["text"]], wide=True)]
-    skipped = [(row["name"], row["reason"]) for row in summary["skipped"]]
-    table = ReportTable("Photographs not used", ("photograph", "reason"), skipped, "skipped")
-    cards += Card.tabular(table, wide=True)
-    return Section.of("confirm", cards)
+    words = caption("reference")
+    card = Card(**words, figures=[figure], tables=[table], text=text + summary["text"], wide=True)
+    skipped = ReportTable.of("skipped", summary["skipped"])
+    return Section.of("confirm", [card, *Card.tabular(skipped, wide=True)])
 
 
 def _optics(harvest: Harvest, summary: Summary) -> Section:
     """Distortion, its standard deviation and its error, as far as they are known."""
     lens, grid, numbers = harvest.optics.distortion, harvest.grid, summary["optics"]
-    assert lens is not None
-
+    if lens is None:
+        return Section.of("optics", [])
     cards = [Card.captioned("distortion", partial(figures.draw_distortion, lens, grid),
                             largest=number(numbers["max_px"]))]  # fmt: skip
     if harvest.optics.calibration is not None:
@@ -322,37 +286,21 @@ def _optics(harvest: Harvest, summary: Summary) -> Section:
 def _calibration_cards(numbers: Mapping[str, Any]) -> list[Card]:
     if "trials" not in numbers:
         return []
-    rows = [
-        (t["degree"], t["unknowns"], t["residual_rms"], t["bic"], t["change_px"], t["sd_px"],
-         Mark("chosen", True) if t["bic"] == 0 else "")
-        for t in numbers["trials"]
-    ]  # fmt: skip
-    columns = ("degree", "unknowns", "residual [levels]", "BIC − lowest", "change of S [px]",
-               "sd of S [px]", "")  # fmt: skip
+    chosen = Mark("chosen", True)
+    trials = [{**t, "chosen": chosen if t["bic"] == 0 else ""} for t in numbers["trials"]]
     parts = zip(numbers["shifts_px"], numbers["shifts_sd_px"], numbers["angles_rad"],
                 numbers["angles_sd_rad"], numbers["matches"], strict=True)  # fmt: skip
     motion = [
-        (k, Measured(shift[1], (sd[1],), 3), Measured(shift[0], (sd[0],), 3),
-         Measured(1000 * angle, (1000 * angle_sd,), 3), f"{match:.3f}")
+        {"number": k, "right": Measured(shift[1], (sd[1],), 3),
+         "down": Measured(shift[0], (sd[0],), 3),
+         "turn": Measured(1000 * angle, (1000 * angle_sd,), 3), "match": f"{match:.3f}"}
         for k, (shift, sd, angle, angle_sd, match) in enumerate(parts, start=1)
     ]  # fmt: skip
-    heads = ("", "right [px]", "down [px]", "turn [mrad]", "match")
     tables = [
-        ReportTable("Choice of the degree", columns, rows, "degrees"),
-        ReportTable(f"The target’s motion in {len(motion)} photographs", heads, motion,
-                    folded=True),
-    ]  # fmt: skip
-    return [Card("Choice of the degree", tables=tables, text=numbers["text"], wide=True)]
-
-
-def _truth_cards(summary: Summary) -> list[Card]:
-    rows = [
-        (row["quantity"], row["obtained"], row["unit"], row["expected"], verdict(row["ok"]))
-        for row in summary.get("truth") or []
+        ReportTable.of("degrees", trials),
+        ReportTable.of("motion", motion, count=len(motion)),
     ]
-    columns = ("quantity", "obtained", "unit", "expected", "")
-    table = ReportTable("Against the truth", columns, rows, "obtained", on_terminal=True)
-    return Card.tabular(table, wide=True)
+    return [Card(tables[0].title, tables=tables, text=numbers["text"], wide=True)]
 
 
 def _timeline(harvest: Harvest, summary: Summary) -> Section:
@@ -367,20 +315,10 @@ def _timeline(harvest: Harvest, summary: Summary) -> Section:
     return Section.of("timeline", cards)
 
 
-_FRAME_COLUMNS = (
-    "photograph", "strain x [%]", "strain y [%]", "pattern, rms [px]", "largest [px]",
-    "sd of it by noise [px]", "… by model error [px]", "model error w, estimated [px]",
-    "w by local DIC [px]", "residual [levels]", "χ²", "iterations on the full image",
-    "… on all levels", "outcome",
-)  # fmt: skip
-
-
 def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
     """Tables of all photographs, and of the modes in those that are shown."""
-    frames = ReportTable("Every photograph", _FRAME_COLUMNS, frame_rows(summary), "frames",
-                         on_terminal=True)  # fmt: skip
     return [
-        *Card.tabular(frames, wide=True),
+        *Card.tabular(ReportTable.of("frames", map(_frame_numbers, summary["frames"])), wide=True),
         *whole_cards([(names[f["name"]], f["whole_field"]) for f in shown if f.get("whole_field")]),
         *_amplitude_cards(shown, names),
         *mode_cards(shown, names),
@@ -388,37 +326,35 @@ def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, s
     ]
 
 
-def frame_rows(summary: Summary) -> list[tuple[Cell, ...]]:
-    """A row for each photograph."""
-    rows: list[tuple[Cell, ...]] = []
-    for frame in summary["frames"]:
-        modes, errors, local = frame["modes"], frame["errors_px"], frame["local"]
-        amplitude = max((m["amplitude_px"] for m in modes), default=None)
-        largest = max((m["largest_px"] for m in modes), default=None)
-        sds = [(errors[cause] or {}).get("fluctuation") for cause in ("noise", "model_error")]
-        rows.append((
-            frame["name"], number(100 * frame["strain_x"], 4), number(100 * frame["strain_y"], 4),
-            number(amplitude, 3), number(largest, 3), *(number(sd, 2) for sd in sds),
-            number(frame["model_error_px"], 2),
-            number(None if local is None else local["w_rms_px"], 2),
-            number(frame["residual_rms"], 3), number(frame["chi_square"], 3),
-            frame["iterations"], frame["iterations_all_levels"],
-            Mark(frame["outcome"], frame["outcome"] == "converged"),
-        ))  # fmt: skip
-    return rows
+def _frame_numbers(frame: Frame) -> dict[str, Cell]:
+    """A photograph's row in the table of all."""
+    modes, errors, local = frame["modes"], frame["errors_px"], frame["local"] or {}
+    noise, model = ((errors[cause] or {}).get("fluctuation") for cause in ("noise", "model_error"))
+    return {
+        **frame,
+        "strain_x": number(100 * frame["strain_x"], 4),
+        "strain_y": number(100 * frame["strain_y"], 4),
+        "pattern": number(max((m["amplitude_px"] for m in modes), default=None), 3),
+        "largest": number(max((m["largest_px"] for m in modes), default=None), 3),
+        "noise": number(noise, 2),
+        "model": number(model, 2),
+        "model_error_px": number(frame["model_error_px"], 2),
+        "local": number(local.get("w_rms_px"), 2),
+        "residual_rms": number(frame["residual_rms"], 3),
+        "chi_square": number(frame["chi_square"], 3),
+        "outcome": Mark(frame["outcome"], frame["outcome"] == "converged"),
+    }
 
 
 def _amplitude_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
-    rows: list[tuple[Cell, ...]] = [
-        (names[frame["name"]], f"φ{i}",
-         ("observable" if mode["observable"] else "not observable")
-         + (", fixed" if mode["fixed"] else ""),
-         number(mode["largest_px"], 3), f"{_micro(mode['v_max_mm'], 4)} ± {_two_errors(mode)}")
+    rows = [
+        {"photograph": names[frame["name"]], "mode": f"φ{i}",
+         "state": "not " * (not mode["observable"]) + "observable" + ", fixed" * mode["fixed"],
+         "largest": number(mode["largest_px"], 3),
+         "v": f"{_micro(mode['v_max_mm'], 4)} ± {_two_errors(mode)}"}
         for frame in frames for i, mode in enumerate(frame["modes"], start=1)
     ]  # fmt: skip
-    columns = ("", "mode", "", "largest v φ [px]", "largest v among the holes [µm]")
-    table = ReportTable("Amplitudes of the modes", columns, rows, "amplitudes", on_terminal=True)
-    return Card.tabular(table, wide=len(frames) > 2)
+    return Card.tabular(ReportTable.of("amplitudes", rows), wide=len(frames) > 2)
 
 
 def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
@@ -455,20 +391,17 @@ def _known(*errors: float | None) -> tuple[float, ...]:
 
 def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
     """Wave vectors of all modes in these frames, with both standard errors."""
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for frame in frames:
         for i, mode in enumerate(frame["modes"], start=1):
             for w, wave in enumerate(mode["waves"], start=1):
                 noise, model = wave["sd_noise"] or [None] * 2, wave["sd_model_error"] or [None] * 2
                 remark = ", fixed" * mode["fixed"] or ", not observable" * (not mode["observable"])
-                rows.append((
-                    names[frame["name"]] if i == w == 1 else "", f"{w} of φ{i}{remark}",
-                    *(Measured(wave["xi"][c], _known(noise[c], model[c])) for c in (0, 1)),
-                ))  # fmt: skip
-    table = ReportTable("Wave vectors", ("", "wave", "ξ₁ [1/l]", "ξ₂ [1/l]"), rows, "waves",
-                        on_terminal=True)  # fmt: skip
+                xi1, xi2 = (Measured(wave["xi"][c], _known(noise[c], model[c])) for c in (0, 1))
+                rows.append({"photograph": names[frame["name"]] if i == w == 1 else "",
+                             "wave": f"{w} of φ{i}{remark}", "xi1": xi1, "xi2": xi2})  # fmt: skip
     words = text_of("photographs-waves")
-    return Card.tabular(table, caption=words, wide=len(frames) > 2)
+    return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=len(frames) > 2)
 
 
 def notes(summary: Summary) -> list[str]:
@@ -477,8 +410,7 @@ def notes(summary: Summary) -> list[str]:
     for frame in summary["frames"]:
         at = f"{frame['name']}, {percent(frame['strain'])}:"
         if frame["outcome"] != "converged":
-            ended = f"the correlation ended as “{frame['outcome']}”: {frame['outcome_why']}"
-            text.append(f"{at} {ended}")
+            text.append(f"{at} {outcome_text(frame)}")
         text += [f"{at} {frame['residual_test']}", f"{at} {_capitalised(frame['weighting'])}"]
     noise = summary["noise"]
     share = "" if noise["of_full_scale"] is None else (

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from modeharvest.report.figures import style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, colour_bar, shaded
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.modes import (
     IDEAL,
@@ -26,33 +26,6 @@ from modeharvest.validation.studies.modes import (
     deviations,
     standardised_errors,
 )
-
-_BUCKLING = {
-    "smallest_ratio": "d/l from", "largest_ratio": "to", "first": "buckles first into",
-    "pattern_share": "pattern’s share of that mode", "critical_strain": "critical strain [%]",
-    "lattice_first": "infinite lattice: first", "lattice_pattern_strain": "pattern critical at [%]",
-    "strain": "measured at [%]", "unstable_pivots": "negative pivots there",
-    "amplitude": "rms of v₁φ₁ [l]", "simulation": "simulation",
-}  # fmt: skip
-_LIKENESS = {
-    "overlap_lattice": "with the infinite lattice: measured",
-    "best_overlap_lattice": "best fit with it",
-    "lattice_overlap_ideal": "Eq. (mode) with it", "overlap_truth": "with the specimen: measured",
-    "best_overlap_truth": "best fit with that", "w_px": "truth − IDIC [px]",
-    "model_error_px": "model error [px]", "measurement_error_px": "measurement error [px]",
-    "iterations": "iterations", "outcome": "outcome",
-}  # fmt: skip
-
-
-def buckling_table(ran: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: into what it buckles, and when."""
-    percent = {name: 100.0 * ran[name] for name in _BUCKLING if name.endswith("strain")}
-    return _renamed(ran.assign(**percent), _BUCKLING)
-
-
-def _renamed(rows: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
-    names = {"varied": "varied", "level": "level", **columns}
-    return rows.reindex(columns=list(names)).rename(columns=names)
 
 
 def parameters_summary(measured: pd.DataFrame) -> pd.DataFrame:
@@ -216,17 +189,19 @@ def draw_patterns(specimens: Mapping[str, SpecimenPatterns]) -> Figure:
 def report_modes(found: ModesAnalysis, seeds: str) -> Findings:
     """The modes' parameters and overlaps, against d/l and all else, and the patterns."""
     ran, measured, sizes = found.ran, found.measured, found.sizes
+    strains = {name: 100.0 * ran[name] for name in ran if name.endswith("strain")}
     return Findings(
         numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
         text=_text(found),
         keys=_keys(sizes),
-        figures=_figures(measured, sizes, found.folder, seeds),
+        figures=_figures(measured, sizes, found.folder),
+        words={"seeds": seeds.capitalize()},
         tables=[
-            ReportTable.of("Buckling", buckling_table(ran)),
-            ReportTable.of("Parameters", parameters_summary(measured)),
-            ReportTable.of("Overlaps and errors", _renamed(measured, _LIKENESS)),
+            ReportTable.of("buckling", ran.assign(**strains).to_dict("records")),
+            ReportTable.of_frame("Parameters", parameters_summary(measured)),
+            ReportTable.of("overlaps", measured.to_dict("records")),
         ],
-        attachments=[ReportTable.of("Every parameter", parameters_table(measured))],
+        attachments=[ReportTable.of_frame("Every parameter", parameters_table(measured))],
     )
 
 
@@ -241,19 +216,18 @@ def _between(values: pd.Series) -> str:
     return " to ".join(ends)
 
 
-def _keys(sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
+def _keys(sizes: pd.DataFrame) -> list[KeyNumber]:
     if not len(sizes):
-        return ()
-    span = f"d/l from {sizes['ratio'].min():.3g} to {sizes['ratio'].max():.3g}"
-    return (
-        KeyNumber("wave vectors", _percent(deviations(sizes)[WAVE_VECTORS]), "",
-                  f"furthest from Eq. (mode) of all measured; {span}"),
-        KeyNumber("a₁", _percent(deviations(sizes)["a1"]), "", f"furthest from 1; {span}"),
-        KeyNumber("overlap", f"{sizes['overlap_lattice'].min():.4f}", "",
-                  f"of the measured with the infinite lattice’s mode, the least; {span}"),
-        KeyNumber("measurement error", number(float(sizes["measurement_error_px"].max())), "px",
-                  f"the largest: rms of IDIC − best fit; {span}"),
-    )  # fmt: skip
+        return []
+    off, ratio = deviations(sizes), sizes["ratio"]
+    values = {
+        "waves-off": _percent(off[WAVE_VECTORS]),
+        "a1-off": _percent(off["a1"]),
+        "overlap": f"{sizes['overlap_lattice'].min():.4f}",
+        "largest-error": number(float(sizes["measurement_error_px"].max())),
+    }
+    ends = {"least": ratio.min(), "most": ratio.max()}
+    return [KeyNumber.of(name, value, **ends) for name, value in values.items()]
 
 
 def _text(found: ModesAnalysis) -> list[str]:
@@ -349,7 +323,9 @@ def _of_strains(ran: pd.DataFrame) -> list[str]:
     return [text_of("modes-strains", least=ratio.min(), most=ratio.max())]
 
 
-def _figures(measured: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) -> list[Card]:
+def _figures(
+    measured: pd.DataFrame, sizes: pd.DataFrame, folder: Path
+) -> dict[str, Callable[[], Figure]]:
     others = measured[measured["varied"] != "d/l"]
     graded = measured[measured["varied"].str.startswith("graded")]
     drawn: dict[str, Callable[[], Figure]] = {}
@@ -364,8 +340,7 @@ def _figures(measured: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: s
         drawn["others"] = partial(draw_parameters, others, at, names, "")
     if len(graded):
         drawn["graded"] = _patterns(graded, folder)
-    return [Card.captioned(name, draw, f"modes-{name}", True, seeds=seeds.capitalize())
-            for name, draw in drawn.items()]  # fmt: skip
+    return drawn
 
 
 def _patterns(rows: pd.DataFrame, folder: Path) -> Callable[[], Figure]:

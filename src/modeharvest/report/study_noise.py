@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import SMALL, WIDE, curve
 from modeharvest.report.figures.maps import ColourScale, colour_bar
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model import Findings, KeyNumber, ReportTable, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.noise_statistics import (
     CAUSES,
@@ -225,19 +225,21 @@ def _estimates(
 def draw_unknowns(pairs: PairedErrors, names: Sequence[str]) -> Figure:
     """Draw each unknown's rms error and coverage."""
     count = pairs.errors.shape[0] * 2
-    place = np.arange(len(names))
+    scatter, spread = 2.0 / np.sqrt(2.0 * count), 2.0 * np.sqrt(0.95 * 0.05 / count)
     drawn = style.figure(9.6, 3.4)
     above, below = drawn.subplots(2, 1, sharex=True)
-    scatter = 1.0 / np.sqrt(2.0 * count)
-    above.axhspan(1 - 2 * scatter, 1 + 2 * scatter, color=style.BLUE, alpha=0.12, linewidth=0)
-    above.plot(place, pairs.ratios, ".", color=style.BLUE)
+    above.axhspan(1 - scatter, 1 + scatter, color=style.BLUE, alpha=0.12, linewidth=0)
+    above.plot(pairs.ratios, ".", color=style.BLUE)
     above.set_ylabel("error / predicted [-]")
-    spread = np.sqrt(0.95 * 0.05 / count)
-    below.axhspan(0.95 - 2 * spread, min(1.0, 0.95 + 2 * spread), color=style.GREEN, alpha=0.15,
-                  linewidth=0)  # fmt: skip
-    below.plot(place, pairs.covered, ".", color=style.GREEN)
+    top = min(1.0, 0.95 + spread)
+    below.axhspan(0.95 - spread, top, color=style.GREEN, alpha=0.15, linewidth=0)
+    below.plot(pairs.covered, ".", color=style.GREEN)
     below.set_ylabel("coverage [-]")
-    _name_families(below, names)
+    firsts: dict[str, int] = {}  # where the unknowns of v0x, v0y, v1 and phi1 begin
+    for k, name in enumerate(names):
+        firsts.setdefault(name.split("[")[0].split(".")[0], k)
+    below.set_xticks(list(firsts.values()), [_FAMILIES.get(name, name) for name in firsts])
+    below.set_xlim(-1, len(names))
     drawn.tight_layout()
     return drawn
 
@@ -274,41 +276,31 @@ def draw_maps(parts: Mapping[str, PairedErrors], points: FieldPoints) -> Figure:
     return drawn
 
 
-def _name_families(axes: Axes, names: Sequence[str]) -> None:
-    """Mark where the unknowns of v0x, v0y, v1 and phi1 begin."""
-    firsts: dict[str, int] = {}
-    for k, name in enumerate(names):
-        firsts.setdefault(name.split("[")[0].split(".")[0], k)
-    axes.set_xticks(list(firsts.values()), [_FAMILIES.get(name, name) for name in firsts])
-    axes.set_xlim(-1, len(names))
-
-
-def _figures(found: NoiseAnalysis, causes: pd.DataFrame, shown: float, seeds: str) -> list[Card]:
-    levels, ours, points = found.by_bound, found.by_least, found.points
-    pairs = max(len(parts["u"].errors) for parts in levels.values())
-    made, at = f"{pairs} pairs of realisations; {seeds}", f"At {100 * shown:g} % of noise"
-    bars = {"curvature, det F, gradient": ours, "curvature": found.by_hessian, "JᵀJ only": levels}
-    unknowns = partial(draw_unknowns, ours[shown]["unknowns"], points.pair.ansatz.names)
-    drawn = {
-        "causes": partial(draw_causes, causes), "ratio": partial(draw_levels, ours, "ratio"),
-        "bias": partial(draw_levels, levels, "bias"),
-        "coverage": partial(draw_levels, ours, "coverage"), "bars": partial(draw_bars, bars),
-        "unknowns": unknowns, "maps": partial(draw_maps, ours[shown], points),
-    }  # fmt: skip
-    return [
-        Card.captioned(name, draw, f"noise-{name}", name in ("causes", "unknowns", "maps"),
-                       made=made, at=at)
-        for name, draw in drawn.items()
-    ]  # fmt: skip
-
-
 def report_noise(found: NoiseAnalysis, seeds: str) -> Findings:
     """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
     levels, ours, row = found.by_bound, found.by_least, found.noise_free.row
-    shown = sorted(levels)[len(levels) // 2]
+    shown, lowest = sorted(levels)[len(levels) // 2], min(levels)
     summary = summary_table(levels, ours, found.by_hessian, found.points.pair)
     causes = causes_table(levels, found.noise_free)
     parts = ("w_px", "model_error_px", "measurement_error_px")
+    bars = {"curvature, det F, gradient": ours, "curvature": found.by_hessian, "JᵀJ only": levels}
+    names, px = found.points.pair.ansatz.names, found.points.pair.images.grid.pixel_size
+    noisy = ", ".join(f"{v:.3f} at {100 * k:g} %" for k, v in found.curvature_sd_ratio.items())
+    values = {
+        "pairs": max(len(parts["u"].errors) for parts in levels.values()), "seeds": seeds,
+        "level": 100 * shown, "of_bound": levels[shown], "of_predicted": ours[shown],
+        "at": _listed(f"{100 * level:g}" for level in levels),
+        "ratio": _listed(ours[level]["u"].ratio for level in levels),
+        "over": _listed(parts["u"].ratio for parts in levels.values()),
+        "bias": _listed(parts["u"].bias for parts in levels.values()),
+        "covered": _listed(ours[level]["unknowns"].standardised.coverage for level in levels),
+        "covered_u": _listed(ours[level]["u"].coverage for level in levels),
+        "bound": levels[lowest]["u"].rms_bound / px / (100.0 * lowest),
+        "causes": dict(zip(CAUSES, causes["u"][: len(CAUSES)], strict=True)),
+        "noisy": noisy, "row": row, "lost": found.not_converged,
+    }  # fmt: skip
+    texts = ["scatter", "bound", "coverage", "bias", "causes", "bars", "without"]
+    texts += ["not-converged"] * (found.not_converged > 0)
     return Findings(
         numbers={
             "levels": summary.to_dict("records"),
@@ -317,78 +309,32 @@ def report_noise(found: NoiseAnalysis, seeds: str) -> Findings:
             "curvature_sd_ratio": {f"{k:g}": v for k, v in found.curvature_sd_ratio.items()},
             "not_converged": found.not_converged,
         },
-        text=(
-            *_level_text(levels, ours, found.points.pair),
-            _cause_text(causes),
-            *_other_text(found),
-        ),
-        keys=_keys(levels, ours, shown),
-        figures=_figures(found, causes, shown, seeds),
+        text=[text_of(f"noise-{name}", **values) for name in texts],
+        keys=[KeyNumber.of(name, **values) for name in
+              ("rms-over-predicted", "rms-over-bound", "bias", "coverage")],
+        figures={
+            "causes": partial(draw_causes, causes),
+            "ratio": partial(draw_levels, ours, "ratio"),
+            "bias": partial(draw_levels, levels, "bias"),
+            "coverage": partial(draw_levels, ours, "coverage"),
+            "bars": partial(draw_bars, bars),
+            "unknowns": partial(draw_unknowns, ours[shown]["unknowns"], names),
+            "maps": partial(draw_maps, ours[shown], found.points),
+        },
+        words=values,
         tables=[
-            ReportTable.of("Noise levels", with_errors(summary)),
-            ReportTable.of("Rms over the bound, by its causes [-]", causes.round(3)),
+            ReportTable.of_frame("Noise levels", with_errors(summary)),
+            ReportTable.of_frame("Rms over the bound, by its causes [-]", causes.round(3)),
         ],
         attachments=[
-            ReportTable.of("Noise levels", summary),
-            ReportTable.of("Each unknown", unknowns_table(levels, ours, found.points.pair)),
-            ReportTable.of("Maps", maps_table(levels, ours, found.points)),
+            ReportTable.of_frame("Noise levels", summary),
+            ReportTable.of_frame("Each unknown", unknowns_table(levels, ours, found.points.pair)),
+            ReportTable.of_frame("Maps", maps_table(levels, ours, found.points)),
         ],
-    )
-
-
-def _keys(levels: Levels, ours: Levels, shown: float) -> tuple[KeyNumber, ...]:
-    at = f"at {100 * shown:g} % of noise"
-    return (
-        KeyNumber("rms error of u", str(ours[shown]["u"].ratio), "",
-                  f"{at}, over the least-squares prediction"),
-        KeyNumber("and over the bound", str(levels[shown]["u"].ratio), "",
-                  "Cramér–Rao, of an ansatz that describes everything"),
-        KeyNumber("bias of u", str(levels[shown]["u"].bias), "", f"{at}, over the bound"),
-        KeyNumber("coverage of 95 % intervals", str(ours[shown]["unknowns"].standardised.coverage),
-                  "", f"{at}; all unknowns"),
     )  # fmt: skip
 
 
-def _level_text(levels: Levels, ours: Levels, pair: VirtualImagePair) -> tuple[str, ...]:
-    px = pair.images.grid.pixel_size
-    at = "at " + _listed(f"{100 * level:g}" for level in levels) + " % of noise in both images"
-    shares = [
-        (
-            ours[level]["u"].ratio, parts["u"].ratio, parts["u"].bias,
-            ours[level]["unknowns"].standardised.coverage, ours[level]["u"].coverage,
-        )
-        for level, parts in levels.items()
-    ]  # fmt: skip
-    ratio, over, bias, covered, covered_u = (
-        _listed(map(str, column)) for column in zip(*shares, strict=True)
-    )
-    bound = levels[min(levels)]["u"].rms_bound / px / (100.0 * min(levels))
-    return (
-        text_of("noise-scatter", ratio=ratio, at=at),
-        text_of("noise-bound", over=over, bound=number(bound)),
-        text_of("noise-coverage", covered=covered, covered_u=covered_u),
-        text_of("noise-bias", bias=bias),
-    )
-
-
-def _listed(words: Iterable[str]) -> str:
+def _listed(things: Iterable[object]) -> str:
     """With commas, and an "and" before the last."""
-    *first, last = words
+    *first, last = map(str, things)
     return f"{', '.join(first)} and {last}" if first else last
-
-
-def _cause_text(causes: pd.DataFrame) -> str:
-    u = dict(zip(causes["what"], causes["u"], strict=True))
-    det, curved, least = (u[CAUSE_LABELS[cause]] for cause in CAUSES[1:])
-    return text_of("noise-causes", det=det, curved=curved, least=least)
-
-
-def _other_text(found: NoiseAnalysis) -> tuple[str, ...]:
-    row, lost = found.noise_free.row, found.not_converged
-    noisy = ", ".join(f"{v:.3f} at {100 * k:g} %" for k, v in found.curvature_sd_ratio.items())
-    measurement, model = (number(float(row[f"{k}_error_px"])) for k in ("measurement", "model"))
-    return (
-        text_of("noise-bars", noisy=noisy),
-        text_of("noise-without", measurement=measurement, model=model),
-        *([f"{lost} correlations did not converge, and count as they ended."] if lost else []),
-    )

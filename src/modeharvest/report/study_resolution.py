@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import curve, plain_ticks
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.validation.scoring.star import KEPT
 from modeharvest.validation.studies.buckled import ResolutionSpec
 from modeharvest.validation.studies.resolution import (
@@ -223,31 +223,23 @@ def report_resolution(found: ResolutionAnalysis, seeds: str) -> Findings:
         },
         text=_text(found, waves, floors),
         keys=_keys(found.chosen, spec),
-        figures=_figures(found, waves, seeds),
+        figures={
+            **{f"transfer-{part}": partial(draw_transfer, part, curves, waves, spec)
+               for part in WAVED},
+            "indicators": partial(draw_indicators, degrees, found.subset_px2),
+            "passband": partial(draw_passband, found.passband),
+        },
+        words={"seeds": seeds, "degree": found.chosen.degree},
         tables=[
-            ReportTable.of("By degree", _by_degree(degrees, spec)),
-            ReportTable.of("Images against best fits", waves),
-            ReportTable.of("Noise floors", floors),
+            ReportTable.of_frame("By degree", _by_degree(degrees, spec)),
+            ReportTable.of_frame("Images against best fits", waves),
+            ReportTable.of_frame("Noise floors", floors),
         ],
         attachments=[
-            ReportTable.of("Finest periods", _finest(degrees, spec)),
-            ReportTable.of("Transfer", _transfer_table(curves, spec)),
+            ReportTable.of_frame("Finest periods", _finest(degrees, spec)),
+            ReportTable.of_frame("Transfer", _transfer_table(curves, spec)),
         ],
-    )
-
-
-def _figures(found: ResolutionAnalysis, waves: pd.DataFrame, seeds: str) -> list[Card]:
-    again = text_of("resolution-again")
-    return [
-        *(Card.captioned(f"transfer-{part}",
-                         partial(draw_transfer, part, found.curves, waves, found.spec),
-                         "resolution-transfer", True, part=part,
-                         again=again if part == "v1" else "") for part in WAVED),
-        Card.captioned("indicators", partial(draw_indicators, found.degrees, found.subset_px2),
-                       "resolution-indicators", seeds=seeds),
-        Card.captioned("passband", partial(draw_passband, found.passband), "resolution-passband",
-                       degree=found.chosen.degree),
-    ]  # fmt: skip
+    )  # fmt: skip
 
 
 def _by_degree(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.DataFrame:
@@ -294,17 +286,16 @@ def _transfer_table(curves: TransferCurves, spec: ResolutionSpec) -> pd.DataFram
     return pd.concat(parts, ignore_index=True)
 
 
-def _keys(chosen: DegreeResolution, spec: ResolutionSpec) -> tuple[KeyNumber, ...]:
+def _keys(chosen: DegreeResolution, spec: ResolutionSpec) -> list[KeyNumber]:
     pitch = spec.buckled.specimen.pitch / spec.buckled.pixel_size
-    at = f"degree {chosen.degree}"
-    keys = []
+    degree, keys = chosen.degree, []
     for part in WAVED:
         x, y = (chosen.finest_px[f"{part} {axis}"] / pitch for axis in AXES)
-        keys.append(KeyNumber(f"l₁₀ % of {part}", f"{x:.1f} – {y:.1f}", "cells", f"{at}; x – y"))
+        keys.append(KeyNumber.of("degree-finest", f"{x:.1f} – {y:.1f}", of=part, degree=degree))
     for name, floor in (("v0", "v0"), ("v1 φ1", "v1phi1")):
-        keys.append(KeyNumber(f"n of {name}", f"{1e3 * chosen.floor_px[floor]:.2f}", "10⁻³ px",
-                              f"{at}; {100 * spec.noise:g} % of noise"))  # fmt: skip
+        n, noise = f"{1e3 * chosen.floor_px[floor]:.2f}", 100 * spec.noise
+        keys.append(KeyNumber.of("degree-noise", n, of=name, degree=degree, noise=noise))
     for part in WAVED:
-        value = number(chosen.indicator_px2[part])
-        keys.append(KeyNumber(f"n l₁₀ % of {part}", value, "px²", at))
-    return tuple(keys)
+        product = number(chosen.indicator_px2[part])
+        keys.append(KeyNumber.of("degree-product", product, of=part, degree=degree))
+    return keys

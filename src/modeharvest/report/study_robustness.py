@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import SMALL, curve
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model import Findings, KeyNumber, ReportTable, text_of
 from modeharvest.validation.studies.robustness import (
     OUTLIER_PERCENT,
     PUBLISHED,
     SAME_PX,
-    GuessStatistics,
     RobustnessAnalysis,
     success_interval,
 )
@@ -55,17 +54,6 @@ def other_minima(moved: pd.DataFrame) -> pd.DataFrame:
         "ε [%]": others["epsilon_percent"].round(3),
         "outcome": others["outcome"].fillna("failed"),
         "iterations": others["all_iterations"],
-    })  # fmt: skip
-
-
-def by_strain(part: pd.DataFrame) -> pd.DataFrame:
-    """Where initial guesses with a wrong strain lead; empty if there was none."""
-    return pd.DataFrame({
-        "strain of the guess, off by [%]": 100.0 * part["strain_error"],
-        "distance of the guess [px]": part["start_distance_px"],
-        "distance of the result [px]": part["distance_px"],
-        "outcome": part["outcome"],
-        "iterations": part["all_iterations"],
     })  # fmt: skip
 
 
@@ -108,13 +96,14 @@ def draw_basin(rows: pd.DataFrame) -> Figure:
 
 def draw_strains(strains: pd.DataFrame) -> Figure:
     """Draw where initial guesses with a wrong strain end."""
-    rows = strains.sort_values("strain of the guess, off by [%]")
-    off = rows["strain of the guess, off by [%]"]
+    rows = strains.sort_values("strain_percent")
+    off = rows["strain_percent"]
     drawn, axes = curve("strain of v₀’s initial guess off by [%]", "distance [px rms]", SMALL)
     for end, label, colour, marker in (
-        ("guess", "initial guess", style.GOLD, "^"), ("result", "result", style.BLUE, "o"),
-    ):  # fmt: skip
-        far = np.maximum(rows[f"distance of the {end} [px]"], 1e-12)
+        ("start_distance_px", "initial guess", style.GOLD, "^"),
+        ("distance_px", "result", style.BLUE, "o"),
+    ):
+        far = np.maximum(rows[end], 1e-12)
         axes.plot(off, far, color=colour, marker=marker, linewidth=1, markersize=4, label=label)
     axes.axhline(SAME_PX, color=style.GREEN, linestyle="--", linewidth=1)
     axes.set(yscale="log")
@@ -122,120 +111,76 @@ def draw_strains(strains: pd.DataFrame) -> Figure:
     return drawn
 
 
-def _figures(
-    asked: pd.DataFrame, basin: pd.DataFrame, strains: pd.DataFrame, radius: float, seeds: str
-) -> list[Card]:
-    outliers = int((asked["epsilon_percent"] > OUTLIER_PERCENT).sum())
-    drawn = {
-        "distances": partial(draw_distances, asked), "epsilon": partial(draw_epsilons, asked),
-        "basin": partial(draw_basin, basin),
-    }  # fmt: skip
-    if len(strains):
-        drawn["strains"] = partial(draw_strains, strains)
-    return [
-        Card.captioned(name, draw, f"robustness-{name}", seeds=seeds, count=len(asked),
-                       radius=f"{100 * radius:g}", limit=OUTLIER_PERCENT,
-                       outliers=outliers or "none", mean=PUBLISHED["mean_epsilon_percent"])
-        for name, draw in drawn.items()
-    ]  # fmt: skip
-
-
 def report_robustness(found: RobustnessAnalysis, seeds: str) -> Findings:
     """Success, epsilon and distance, and the basin's picture."""
-    radius, strains = found.statistics.radius, by_strain(found.strains)
+    asked, statistics = found.at_radius, found.statistics
+    strains = found.strains.assign(strain_percent=100.0 * found.strains["strain_error"])
     basin = by_radius(found.moved[found.moved["radius"] > 0.0])
-    tables = {"Basin of convergence": basin}
+    low, high = statistics.success_interval_95
+    elsewhere = statistics.initial_guesses - statistics.same_minimum - statistics.failed
+    values = {
+        "found": statistics, "published": PUBLISHED, "seeds": seeds, "same": SAME_PX,
+        "limit": OUTLIER_PERCENT, "outliers": statistics.outliers or "none",
+        "elsewhere": elsewhere, "radius": 100 * statistics.radius,
+        "success": 100 * statistics.success, "low": 100 * low, "high": 100 * high,
+        "paper": 100 * PUBLISHED["success"],
+    }  # fmt: skip
+    texts = ["success", "epsilon", "distance", "phases"]
+    texts += ["elsewhere"] * (elsewhere > 0) + ["failed"] * (statistics.failed > 0)
+    figures = {
+        "distances": partial(draw_distances, asked),
+        "epsilon": partial(draw_epsilons, asked),
+        "basin": partial(draw_basin, basin),
+    }
+    tables = [ReportTable.of_frame("Basin of convergence", basin)]
     if not found.moved["same"].all():
-        tables["Other minima"] = other_minima(found.moved)
+        tables.append(ReportTable.of_frame("Other minima", other_minima(found.moved)))
     if len(strains):
-        tables["Initial guess of v0"] = strains
+        figures["strains"] = partial(draw_strains, strains)
+        tables.append(ReportTable.of("strains", strains.to_dict("records")))
     return Findings(
-        numbers={**asdict(found.statistics), "basin": basin.to_dict("records")},
-        text=(
-            *_text(found.statistics),
-            *_basin_text(basin),
+        numbers={**asdict(statistics), "basin": basin.to_dict("records")},
+        text=[
+            *(text_of(f"robustness-{name}", **values) for name in texts),
+            _basin_text(basin),
             *_undetected(found.moved),
             *_strain_text(strains),
-        ),
-        keys=_keys(found.statistics),
-        figures=_figures(found.at_radius, basin, strains, radius, seeds),
-        tables=[ReportTable.of(title, table) for title, table in tables.items()],
+        ],
+        keys=[KeyNumber.of(name, **values) for name in ("same-minimum", "epsilon", "distance")],
+        figures=figures,
+        words={**values, "count": len(asked)},
+        tables=tables,
     )
 
 
-def _keys(found: GuessStatistics) -> tuple[KeyNumber, ...]:
-    low, high = found.success_interval_95
-    return (
-        KeyNumber(
-            "initial guesses that converge", f"{found.same_minimum} of {found.initial_guesses}", "",
-            f"95 % interval {100 * low:.1f} to {100 * high:.1f} %; the paper: 98 of 100",
-        ),
-        KeyNumber(
-            "mean ε, as the paper defines it", number(found.mean_epsilon_percent), "%",
-            f"the paper: {PUBLISHED['mean_epsilon_percent']} %, without two outliers "
-            f"{PUBLISHED['mean_epsilon_without_outliers_percent']} %",
-        ),
-        KeyNumber(
-            "largest distance between results", number(found.largest_distance_px), "px",
-            f"rms; initial guesses up to {found.largest_start_distance_px:.3g} px away",
-        ),
-    )  # fmt: skip
-
-
-def _text(found: GuessStatistics) -> tuple[str, ...]:
-    low, high = found.success_interval_95
-    elsewhere = found.initial_guesses - found.same_minimum - found.failed
-    text = [
-        text_of("robustness-success", found=found, radius=100 * found.radius, same=SAME_PX,
-                 success=100 * found.success, low=100 * low, high=100 * high,
-                 published=100 * PUBLISHED["success"]),
-        text_of("robustness-epsilon", mean=number(found.mean_epsilon_percent),
-                 largest=number(found.largest_epsilon_percent), limit=OUTLIER_PERCENT,
-                 outliers=found.outliers or "none", published=PUBLISHED),
-        text_of("robustness-distance", largest=number(found.largest_distance_px),
-                 arrived=number(found.largest_distance_of_arrived_px)),
-        text_of("robustness-phases"),
-    ]  # fmt: skip
-    if elsewhere:
-        text.append(text_of("robustness-elsewhere", elsewhere=elsewhere,
-                             converged=found.other_minimum_called_converged))  # fmt: skip
-    if found.failed:
-        text.append(f"{found.failed} failed, and count as not converged to it.")
-    return tuple(text)
-
-
-def _basin_text(basin: pd.DataFrame) -> tuple[str, ...]:
+def _basin_text(basin: pd.DataFrame) -> str:
     """Up to where all converge to the same minimum."""
     full = basin["same minimum"] == basin["initial guesses"]
     sure = basin.loc[full.cummin(), "off by up to [%]"]
-    text = "At no radius do all initial guesses converge to it."
+    text = text_of("robustness-nowhere")
     if len(sure):
-        text = f"All initial guesses converge to the same minimum up to {sure.iloc[-1]:g} % off."
+        text = text_of("robustness-sure", sure=sure.iloc[-1])
     if not full.all():
-        lowest = basin.loc[basin["success [%]"].idxmin()]
-        text += (f" The fewest do so at {lowest['off by up to [%]']:g} %: "
-                 f"{lowest['same minimum']:.0f} of {lowest['initial guesses']:.0f}.")  # fmt: skip
-    return (text,)
+        radius, count, same, *_ = basin.loc[basin["success [%]"].idxmin()]
+        text += text_of("robustness-fewest", radius=radius, same=same, count=count)
+    return text
 
 
-def _undetected(moved: pd.DataFrame) -> tuple[str, ...]:
+def _undetected(moved: pd.DataFrame) -> list[str]:
     """How many other minima the paper's error does not detect."""
     others = moved[~moved["same"] & moved["distance_px"].notna()]
     unseen = others[others["epsilon_percent"] <= OUTLIER_PERCENT]["distance_px"]
     if not len(unseen):
-        return ()
-    least, most = (number(float(end)) for end in (unseen.min(), unseen.max()))
-    return (text_of("robustness-undetected", unseen=len(unseen), others=len(others), least=least,
-                     most=most, limit=OUTLIER_PERCENT),)  # fmt: skip
+        return []
+    return [text_of("robustness-undetected", unseen=unseen, others=others, limit=OUTLIER_PERCENT,
+                    least=unseen.min(), most=unseen.max())]  # fmt: skip
 
 
-def _strain_text(strains: pd.DataFrame) -> tuple[str, ...]:
+def _strain_text(strains: pd.DataFrame) -> list[str]:
     if not len(strains):
-        return ()
-    same = strains["distance of the result [px]"] < SAME_PX
-    off = strains["strain of the guess, off by [%]"]
+        return []
+    same, off = strains["distance_px"] < SAME_PX, strains["strain_percent"]
     tried, converged = (", ".join(f"{v:+g}" for v in part).replace("-", "−")
                         for part in (off, off[same]))  # fmt: skip
     which = "" if same.all() or not same.any() else f": {converged} %"
-    return (text_of("robustness-strains", tried=tried, same=int(same.sum()), count=len(strains),
-                     which=which),)  # fmt: skip
+    return [text_of("robustness-strains", tried=tried, same=same.sum(), off=off, which=which)]

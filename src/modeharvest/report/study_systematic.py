@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from modeharvest.report.figures import style
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.validation.studies.systematic import (
     BASE,
     FACTORS,
@@ -95,60 +95,53 @@ _COLUMNS = 3
 
 def report_systematic(found: SystematicAnalysis, seeds: str) -> Findings:
     """Errors against each factor, as curves and tables."""
-    bases, levels = found.bases, by_level(found)
+    levels = by_level(found)
     spans = by_factor(levels)
-    drawn = partial(draw_factors, levels, bases)
-    figure = Card.captioned("factors", drawn, "systematic-factors", True, seeds=seeds)
+    first, base = spans.iloc[0], found.base
+    values = {"base": base, "factor": _short(first["factor"]), "moved": first[f"largest, {MOVED}"]}
+    keys = ("base-measurement", "base-model", "matters-most")
     return Findings(
-        numbers={"base": dict(found.base), "factors": spans.to_dict("records")},
-        text=_text(levels, spans, found.base),
-        keys=_keys(spans, found.base),
-        figures=[figure],
+        numbers={"base": dict(base), "factors": spans.to_dict("records")},
+        text=[
+            text_of("systematic-base", base=base),
+            *_text(levels, spans),
+            text_of("systematic-model-error"),
+        ],
+        keys=[KeyNumber.of(name, **values) for name in keys],
+        figures={"factors": partial(draw_factors, levels, found.bases)},
+        words={"seeds": seeds},
         tables=[
-            ReportTable.of("Which factor matters", spans),
-            ReportTable.of("Every level", levels.drop(columns="number")),
+            ReportTable.of_frame("Which factor matters", spans),
+            ReportTable.of_frame("Every level", levels.drop(columns="number")),
         ],
     )
-
-
-def _keys(spans: pd.DataFrame, base: Mapping[str, float]) -> tuple[KeyNumber, ...]:
-    first = spans.iloc[0]
-    return (
-        KeyNumber("measurement error", number(base["measurement_error_px"]), "px",
-                  "at the base: rms of IDIC − best fit, per component"),
-        KeyNumber("model (ansatz) error", number(base["model_error_px"]), "px",
-                  "at the base: rms of truth − best fit"),
-        KeyNumber("matters most", str(first["factor"]).split(" [")[0], "",
-                  f"moves the measurement by up to {first[f'largest, {MOVED}']:.2g} px"),
-    )  # fmt: skip
 
 
 _FAR, _NEAR = 0.1, 0.01
 """Factors that move the measurement by more, or by less, are listed apart [px]."""
 
 
-def _text(levels: pd.DataFrame, spans: pd.DataFrame, base: Mapping[str, float]) -> tuple[str, ...]:
-    names = {"measurement": "measurement_error_px", "model": "model_error_px", "v1": "v1_percent"}
-    values = {name: number(base[key]) for name, key in names.items()}
-    text = [text_of("systematic-base", **values)]
-    far = spans[f"largest, {MOVED}"]
-    for heading, part in (
-        (f"These move the measurement by more than {_FAR:g} px", spans[far > _FAR]),
-        (f"These by {_NEAR:g} to {_FAR:g} px", spans[(far >= _NEAR) & (far <= _FAR)]),
-        (f"These by less than {_NEAR:g} px", spans[far < _NEAR]),
-    ):
-        if len(part):
-            named = ", ".join(
-                f"{row['factor'].split(' [')[0]} ({number(float(f'{moved:.2g}'))} px)"
-                for moved, (_, row) in zip(far[part.index], part.iterrows(), strict=True)
-            )
-            text.append(f"{heading}: {named}.")
+def _short(factor: str) -> str:
+    """A factor's label without its unit."""
+    return factor.split(" [")[0]
+
+
+def _text(levels: pd.DataFrame, spans: pd.DataFrame) -> list[str]:
+    """The factors by how far they move the measurement, and what did not converge."""
+    text, moved = [], spans[f"largest, {MOVED}"]
+    for heading, part in {
+        f"These move the measurement by more than {_FAR:g} px": moved > _FAR,
+        f"These by {_NEAR:g} to {_FAR:g} px": (moved >= _NEAR) & (moved <= _FAR),
+        f"These by less than {_NEAR:g} px": moved < _NEAR,
+    }.items():
+        factors = zip(spans["factor"][part], moved[part], strict=True)
+        named = ", ".join(f"{_short(factor)} ({number(far, 2)} px)" for factor, far in factors)
+        text += [f"{heading}: {named}."] if named else []
     lost_ones = levels[levels["converged"].map(_not_all_converged)]
     if len(lost_ones):
         named = ", ".join(f"{r['name']} = {number(r['level'])}" for _, r in lost_ones.iterrows())
         text.append(f"Not every correlation converged at {named}: left out above.")
-    text.append(text_of("systematic-model-error"))
-    return tuple(text)
+    return text
 
 
 def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Figure:

@@ -63,7 +63,7 @@ def grade_star(
         raise InputError(
             f"expected a --still for each of {len(fields)} fields, or none, got {len(stills)}"
         )
-    from modeharvest.report.grades import write_star_grading
+    from modeharvest.report.grades import write_grading
 
     star_set = StarSet.read(folder)
     require_writable(out)
@@ -76,7 +76,7 @@ def grade_star(
 
     grades, refused = _graded(fields, grade, progress, "resolution")
     grading = StarGrading(star_set, tuple(ranked_grades(grades)), refused)
-    write_star_grading(out, grading)
+    write_grading(out, grading)
     progress(1, 1, "resolution")
     return grading
 

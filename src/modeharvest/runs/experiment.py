@@ -207,8 +207,11 @@ class Run(StagedRun[Case]):
 
     def _report(self, images: ImageSet, page: Path) -> dict[str, Any]:
         """Compare with the truth and write the report; returns the content of the summary."""
-        from modeharvest.report.experiment import experiment_figures, experiment_report
-        from modeharvest.report.figures.experiment import ExperimentData
+        from modeharvest.report.experiment import (
+            ExperimentData,
+            experiment_figures,
+            experiment_report,
+        )
         from modeharvest.report.model import draw_figures, write_page
 
         case, solution, results = self.case, self._solution(), self._results(images)

@@ -108,6 +108,14 @@ def quantities(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
             yield f.metadata["label"], f.metadata["unit"], f.name
 
 
+def headings(*kinds: type[Any]) -> dict[str, str]:
+    """Of dataclasses' quantities by their names: labels with units, as a table's headings."""
+    found: dict[str, str] = {}
+    for label, unit, name in (quantity for kind in kinds for quantity in quantities(kind)):
+        found.setdefault(name, f"{label} [{unit}]" if unit not in ("", "–") else label)
+    return found
+
+
 def described(error: ValidationError, model: type[Any] | None, skipped: int = 0) -> str:
     """The first fault, in one line: where, what came, what was expected.
 

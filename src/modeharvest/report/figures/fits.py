@@ -123,35 +123,23 @@ class Panel(Generic[S]):
     draw: Callable[[S], Figure]
     shows: Callable[[S], bool] = always
     """Whether there is something to draw."""
-    words: Mapping[str, Any] = field(default_factory=dict)
-    """Its title, symbol, panel in the paper, and caption."""
+    text: str = ""
+    """The name of its words; by default the key."""
+    figure: str = "-"
+    """In the paper; empty for none."""
     exact: bool = False
     """Whether the picture's pixels are kept exactly."""
     late: bool = False
     """Whether what it shows may still be computed meanwhile."""
+    values: Mapping[str, object] = field(default_factory=dict)
+    """What is filled into its words."""
 
-    @classmethod
-    def of(
-        cls,
-        section: str,
-        key: str,
-        draw: Callable[[S], Figure],
-        shows: Callable[[S], bool] = always,
-        text: str = "",
-        figure: str = "-",
-        *,
-        exact: bool = False,
-        late: bool = False,
-        **values: object,
-    ) -> Panel[S]:
-        """With the words named ``text``, or as the key; ``figure``: in the paper, "" for none."""
-        words = caption(text or key, figure=figure, **values)
-        words["paper"] = f"paper: Fig. {words['paper']}" if figure and "paper" in words else ""
-        return cls(section, key, draw, shows, words, exact, late)
-
-    def without_caption(self) -> Panel[S]:
-        """Where there is nothing to compare with."""
-        return replace(self, words={**self.words, "caption": ""})
+    @property
+    def words(self) -> dict[str, Any]:
+        """Its title, symbol, panel in the paper, and caption."""
+        words = caption(self.text or self.key, figure=self.figure, **self.values)
+        paper = f"paper: Fig. {words['paper']}" if self.figure and "paper" in words else ""
+        return {**words, "paper": paper}
 
     def card(self, states: Sequence[S], numbers: Callable[[str, S], str]) -> Card:
         """Its pictures of these states; ``numbers`` makes the lines below them."""
@@ -231,27 +219,33 @@ def spectrum_panels(
 
     ``figure``: the paper's; empty for patterns that aren't the paper's.
     """
-    xx, yy = (
-        Panel.of(section, key, partial(_spectrum, component=component), shows, figure=figure,
-                 late=True, states=states)
-        for component, key in enumerate(("Sxx", "Syy"))
-    )  # fmt: skip
-    return [xx, yy if figure else yy.without_caption()]
+    texts = {"Sxx": "Sxx", "Syy": "Syy" if figure else "Syy-other"}
+    return [
+        Panel(section, key, partial(_spectrum, component=component), shows, text, figure,
+              late=True, values={"states": states})
+        for component, (key, text) in enumerate(texts.items())
+    ]  # fmt: skip
 
 
 def ansatz_panels(section: str, figure: str, modes: int) -> list[Panel[FittedState]]:
     """v0, and of each mode amplitude, shape and fluctuation."""
-    x, y = (Panel.of(section, key, partial(_v0, component=component), figure=figure)
-            for component, key in enumerate(("v0x", "v0y")))  # fmt: skip
-    panels: list[Panel[FittedState]] = [x, y if figure else y.without_caption()]
+    text = "v0y" if figure else "v0y-other"
+    panels: list[Panel[FittedState]] = [
+        Panel(section, "v0x", partial(_v0, component=0), figure=figure),
+        Panel(section, "v0y", partial(_v0, component=1), text=text, figure=figure),
+    ]
     for i in range(modes):
-        own: dict[str, Any] = {"shows": has_mode(i), "figure": figure if i == 0 else "", "n": i + 1}
+        drawn: dict[str, Callable[[FittedState], Figure]] = {
+            "v{}": partial(_amplitude, i=i),
+            "phi{}": partial(_shape, i=i),
+            "fluc{}x": partial(_fluctuation, i=i, component=0),
+            "fluc{}y": partial(_fluctuation, i=i, component=1),
+        }
+        values = {"n": i + 1, "enlarged": DRAWN_SHAPE}
         panels += [
-            Panel.of(section, f"v{i + 1}", partial(_amplitude, i=i), text="v", **own),
-            Panel.of(section, f"phi{i + 1}", partial(_shape, i=i), text="phi",
-                     enlarged=DRAWN_SHAPE, **own),
-            *(Panel.of(section, f"fluc{i + 1}{axis}", partial(_fluctuation, i=i, component=c),
-                       text=f"fluc{axis}", **own) for c, axis in enumerate("xy")),
+            Panel(section, name.format(i + 1), draw, has_mode(i), name.format(""),
+                  "" if i else figure, values=values)
+            for name, draw in drawn.items()
         ]  # fmt: skip
     return panels
 

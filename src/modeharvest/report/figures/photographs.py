@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -45,8 +45,6 @@ _NO_PATTERN = WavePattern((), None, "none", None, 0.0, ())
 _SPECK = 0.01  # l²: holes and islands smaller than that are not drawn
 _LEVELS = (0.5, 99.5)  # percentiles of the reference's grey levels, drawn black and white
 _REACH = 0.75  # spacings of a local DIC from a point, within which a cell has its value
-
-Cause = Literal["noise", "model"]
 
 
 def shown_frames(harvest: Harvest) -> tuple[HarvestedFrame, ...]:
@@ -211,29 +209,31 @@ def draw_w(state: PhotographState) -> Figure:
     return fits.draw_length(state, np.where(near <= reach, length, np.nan), cells)
 
 
-def draw_error(state: PhotographState, field: str, cause: Cause) -> Figure:
-    """Draw the standard deviation of "v0", "v1", ... or "fluc1", ..., lengths of vector fields.
+def has_error(state: PhotographState, name: str, i: int, cause: str) -> bool:
+    """Whether a standard deviation, named as for :func:`draw_error`, is known."""
+    return _errors(state, cause) is not None and (name == "v0" or fits.has_mode(i)(state))
+
+
+def draw_error(state: PhotographState, name: str, i: int, cause: str) -> Figure:
+    """Draw the standard deviation of "v0", or of "v" or "fluc" of mode i, by "noise" or "model".
 
     That of a vector is the root of the sum of both components' variances.
     """
-    map_frame, frame = state.view.map_frame(fits.COARSE), state.frame
-    errors = frame.by_noise if cause == "noise" else frame.by_model_error
+    map_frame, errors = state.view.map_frame(fits.COARSE), _errors(state, cause)
     assert errors is not None
-    sd = UM * _resampled(frame, _sd(errors, field), map_frame)
-    if field != "v0":
-        i = int(field.removeprefix("fluc").removeprefix("v")) - 1
+    if name == "v":
+        sd = np.asarray(errors.v[i])
+    else:
+        sd = np.linalg.norm(errors.v0 if name == "v0" else errors.fluctuation[i], axis=-1)
+    sd = UM * _resampled(state.frame, sd, map_frame)
+    if name != "v0":
         sd = np.where(state.support(i, fits.COARSE) > 0.0, sd, np.nan)
     scale = ColourScale.size(state.view.on_material(sd, fits.COARSE), "µm", 0.99)
     return maps.draw_field(map_frame, sd, scale)
 
 
-def _sd(errors: FieldErrors, field: str) -> FloatArray:
-    """(q, p) standard deviation of a field [mm]."""
-    if field == "v0":
-        return np.asarray(np.linalg.norm(errors.v0, axis=-1))
-    if field.startswith("fluc"):
-        return np.asarray(np.linalg.norm(errors.fluctuation[int(field[4:]) - 1], axis=-1))
-    return np.asarray(errors.v[int(field[1:]) - 1])
+def _errors(state: PhotographState, cause: str) -> FieldErrors | None:
+    return state.frame.by_noise if cause == "noise" else state.frame.by_model_error
 
 
 def _resampled(frame: HarvestedFrame, sd: FloatArray, map_frame: maps.MapFrame) -> FloatArray:

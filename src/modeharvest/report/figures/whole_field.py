@@ -15,8 +15,8 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.report.figures import fits
 from modeharvest.report.figures.fits import UM, Panel, S
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
-from modeharvest.report.model import Card, Cell, ReportTable
-from modeharvest.util.typed import quantities
+from modeharvest.report.model import Card, Cell, ReportTable, text_of
+from modeharvest.util.typed import headings
 from modeharvest.validation.truth import lengths
 from modeharvest.validation.whole_field import WholeField, WholeFieldNumbers, WholeFieldSummary
 
@@ -54,10 +54,10 @@ class WholeMaps(Generic[S]):
             return shows(state) and (self.is_known is not None or self.truth(state) is not None)
 
         return [
-            Panel.of("whole", "whole-w", self._w, shows, scale, figure, late=True),
-            Panel.of("whole", "whole-error", self._error, known, late=True),
-            Panel.of("whole", "whole-strain", self._principal_strain, shows, late=True),
-            Panel.of("whole", "whole-deviation", self._deviation, shows, late=True),
+            Panel("whole", "whole-w", self._w, shows, scale, figure, late=True),
+            Panel("whole", "whole-error", self._error, known, late=True),
+            Panel("whole", "whole-strain", self._principal_strain, shows, late=True),
+            Panel("whole", "whole-deviation", self._deviation, shows, late=True),
         ]
 
     def _measured(self, state: S) -> NodalResult:
@@ -107,18 +107,12 @@ def _pixels(frame: MapFrame, grid: PixelGrid) -> PixelGrid:
 def whole_panel_numbers(key: str, numbers: Numbers) -> str:
     """One line under the picture of a panel; empty if there is nothing to add."""
     if key == "whole-w" and "w_rms_px" in numbers:
-        return (
-            f"rms {numbers['w_rms_px']:.3g} px per component, largest length "
-            f"{numbers['w_max_px']:.3g} px"
-        )
+        return text_of(key, **numbers)
     if key == "whole-error":
-        return (
-            f"rms {numbers['rms_px']:.2g} px per component on {100 * numbers['coverage']:.4g} % of "
-            f"the material, {numbers['rms_edges_px'] or 0.0:.2g} px within 10 px of an edge; "
-            f"largest length {numbers['max_px']:.2g} px"
-        )
+        edges, share = numbers["rms_edges_px"] or 0.0, 100 * numbers["coverage"]
+        return text_of(key, edges=edges, share=share, **numbers)
     if key == "whole-deviation" and "interval_coverage" in numbers:
-        return f"{100 * numbers['interval_coverage']:.3g} % of the truth in intervals of 95 %"
+        return text_of(key, covered=100 * numbers["interval_coverage"])
     return ""
 
 
@@ -127,16 +121,9 @@ def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
     if not found:
         return []
     labels, numbers = zip(*found, strict=True)
-    heads: dict[str, str] = {}
-    for kind in (WholeFieldNumbers, WholeFieldSummary):
-        for label, unit, name in quantities(kind):
-            heads.setdefault(name, f"{label} [{unit}]" if unit not in ("", "–") else label)
-    rows: list[tuple[Cell, ...]] = [
-        (head, *(n.get(name) for n in numbers)) for name, head in heads.items()
-    ]
-    rows = [row for row in rows if any(value is not None for value in row[1:])]
-    table = ReportTable("Whole displacement", ("rms: per component", *labels), rows,
-                        "whole-numbers", on_terminal=True)  # fmt: skip
+    heads = headings(WholeFieldNumbers, WholeFieldSummary)
+    table = ReportTable.of_states("Whole displacement", "rms: per component", heads, found,
+                                  name="whole-numbers", on_terminal=True)  # fmt: skip
     both = ("refitted to the whole displacement", "by IDIC")
     columns = ("", "", *(f"{label}: {way}" for label in labels for way in both))
     modes = ReportTable("Modes by both ways", columns, list(_mode_rows(numbers)), "whole-modes")
