@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import product
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -37,6 +38,7 @@ _BRIGHT = LinearSegmentedColormap.from_list(  # of densities, seen on their own 
 _LOADS = LinearSegmentedColormap.from_list(
     "loads", to_rgba_array([BLUE, style.GREEN, style.GOLD, RED])
 )
+_SHIFTS = np.array(list(product(range(-2, 3), repeat=2)))  # to reciprocal vectors near zero
 _PIXELS = 360  # along a zone map's side
 _NEAR = 2e-4  # turns: waves that near are the same
 _UNIT = "N/mm⁴"
@@ -214,8 +216,7 @@ def _plane(half: float) -> tuple[Figure, Axes]:
 
 def _first_zone(reciprocal: FloatArray) -> FloatArray:
     """(c, 2) corners of the first Brillouin zone, in the units of the reciprocal vectors."""
-    steps = np.arange(-2, 3)
-    points = np.array([[i, j] for i in steps for j in steps]) @ reciprocal
+    points = _SHIFTS @ reciprocal
     cells = Voronoi(points)
     centre = int(np.argmin(np.linalg.norm(points, axis=1)))
     corners = cells.vertices[cells.regions[cells.point_region[centre]]]
@@ -224,12 +225,8 @@ def _first_zone(reciprocal: FloatArray) -> FloatArray:
 
 def _images(critical: Sequence[Wave], reciprocal: FloatArray, half: float) -> FloatArray:
     """(c, 2) all wave vectors within ± half that are the critical waves or their opposites."""
-    steps = np.arange(-2, 3)
-    shifts = np.array([[i, j] for i in steps for j in steps])
-    turns = [s * np.asarray(wave) / (2.0 * np.pi) + shifts for wave in critical for s in (1, -1)]
-    if not turns:
-        return np.zeros((0, 2))
-    xi = np.unique(np.round(np.vstack(turns) @ reciprocal, 9), axis=0)
+    turns = (_turns(critical)[:, None] + _SHIFTS).reshape(-1, 2)
+    xi = np.unique(np.round(turns @ reciprocal, 9), axis=0)
     return np.asarray(xi[np.abs(xi).max(axis=1) <= half])
 
 
@@ -246,13 +243,14 @@ def _zone_scale(values: FloatArray) -> ColourScale:
 
 def _on_path(waves: FloatArray, critical: Sequence[Wave]) -> NDArray[np.bool_]:
     """(p,) which waves of a path are critical ones, or their opposites."""
-    turns = np.asarray(waves) / (2.0 * np.pi)
-    on = np.zeros(len(turns), dtype=bool)
-    for wave in critical:
-        for sign in (1.0, -1.0):
-            off = turns - sign * np.asarray(wave) / (2.0 * np.pi)
-            on |= np.abs(off - np.rint(off)).max(axis=1) < _NEAR
-    return on
+    off = np.asarray(waves)[:, None] / (2.0 * np.pi) - _turns(critical)
+    return np.asarray((np.abs(off - np.rint(off)).max(axis=-1) < _NEAR).any(axis=1))
+
+
+def _turns(critical: Sequence[Wave]) -> FloatArray:
+    """(2c, 2) phases of the critical waves and their opposites, in turns."""
+    phases = np.reshape(np.asarray(critical, dtype=np.float64), (-1, 2))
+    return np.asarray(np.vstack([phases, -phases]) / (2.0 * np.pi), dtype=np.float64)
 
 
 def draw_energies(branches: Sequence[Branch], critical: float | None) -> Figure:
