@@ -45,13 +45,6 @@ from modeharvest.validation.whole_field import WholeField, WholeFieldSummary
 Snapshot = Mapping[str, Any]
 Summary = Mapping[str, Any]
 
-_BRIEF = {
-    "branch": "branch", "pattern_amplitude_px": "pattern, largest length [px]",
-    "rms_w_px": "w = truth − IDIC, rms [px]", "rms_best_fit_px": "model error, rms [px]",
-    "rms_idic_to_best_fit_px": "measurement error, rms [px]", "chi_square": "χ² of the residual",
-    "iterations_all_levels": "iterations on all levels", "outcome": "outcome",
-}  # fmt: skip
-"""What the terminal shows of each snapshot."""
 _MODE = tuple(
     zip(("a₁", "a₂", "a₃", "a₄", "a₅", "a₆", "a₇"), ("-",) * 5 + ("mm",) * 2, strict=True)
 )
@@ -212,7 +205,7 @@ def experiment_report(summary: Summary, data: ExperimentData | None = None) -> R
             *_energies(summary),
         ],
         keys=key_numbers(summary),
-        brief=ReportTable.of_states("Results", "nominal strain", _BRIEF, brief),
+        brief=ReportTable.of_states("brief", brief),
         sections=[
             Section.of("expected", expected_cards("expected", summary.get("expected", []))),
             *([] if data is None else _figures(data, summary)),
@@ -308,8 +301,7 @@ def number_cards(summary: Summary) -> list[Card]:
         (snapshot_label(s["nominal_strain"], s["branch"], critical), s | s.get("whole_field", {}))
         for s in snapshots
     ]
-    corner = "rms: per component, all material"
-    table = ReportTable.of_states("Results", corner, heads, states, name="results")
+    table = ReportTable.of_states("results", states, heads)
     return [*Card.tabular(table, wide=True), *_mode_cards(summary)]
 
 

@@ -281,9 +281,7 @@ def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
         return []
     names = {name: name for name, _ in rows[0]["corners"] if name != "Γ"}
     loads = [(percent(row["load"]), dict(row["corners"])) for row in rows]
-    table = ReportTable.of_states("Lowest eigenvalue [N/mm⁴]", "wave", names, loads,
-                                  on_terminal=True)  # fmt: skip
-    corners = Card.tabular(table)
+    corners = Card.tabular(ReportTable.of_states("corners", loads, names))
     if run is None or run.dispersion is None:
         return corners
     found, waves = run.dispersion, run.critical.waves if run.critical else ()

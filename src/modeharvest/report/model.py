@@ -176,19 +176,21 @@ class ReportTable:
     @classmethod
     def of_states(
         cls,
-        title: str,
-        corner: str,
-        heads: Mapping[str, str],
+        name: str,
         states: Sequence[tuple[str, Mapping[str, Any]]],
-        **more: Any,
+        heads: Mapping[str, str] | None = None,
     ) -> ReportTable:
         """A column for each of some labelled states, a row for each quantity that one has.
 
-        ``corner``: above the quantities, whose headings are ``heads``.
+        The table is named as for :meth:`of`; ``heads``: headings of the quantities by their keys,
+        by default its columns.
         """
-        rows = [[head, *(state.get(key) for _, state in states)] for key, head in heads.items()]
+        words = dict(_captions()[f"table-{name}"])
+        every = (words.pop("columns") if heads is None else heads).items()
+        rows = [[head, *(state.get(key) for _, state in states)] for key, head in every]
         rows = [row for row in rows if any(value is not None for value in row[1:])]
-        return cls(title, [corner, *(label for label, _ in states)], rows, **more)
+        columns = [words.pop("corner"), *(label for label, _ in states)]
+        return cls(columns=columns, rows=rows, **words)
 
     @classmethod
     def of_frame(cls, title: str, table: pd.DataFrame) -> ReportTable:

@@ -122,8 +122,7 @@ def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
         return []
     labels, numbers = zip(*found, strict=True)
     heads = headings(WholeFieldNumbers, WholeFieldSummary)
-    table = ReportTable.of_states("Whole displacement", "rms: per component", heads, found,
-                                  name="whole-numbers", on_terminal=True)  # fmt: skip
+    table = ReportTable.of_states("whole", found, heads)
     both = ("refitted to the whole displacement", "by IDIC")
     columns = ("", "", *(f"{label}: {way}" for label in labels for way in both))
     modes = ReportTable("Modes by both ways", columns, list(_mode_rows(numbers)), "whole-modes")
