@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from modeharvest.report.figures import style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, colour_bar, shaded
-from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model import Findings, KeyNumber, ReportTable, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.modes import (
     IDEAL,
@@ -190,10 +190,19 @@ def report_modes(found: ModesAnalysis, seeds: str) -> Findings:
     """The modes' parameters and overlaps, against d/l and all else, and the patterns."""
     ran, measured, sizes = found.ran, found.measured, found.sizes
     strains = {name: 100.0 * ran[name] for name in ran if name.endswith("strain")}
+    values = _of_sizes(sizes) if len(sizes) else {}
     return Findings(
         numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
-        text=_text(found),
-        keys=_keys(sizes),
+        text=[
+            *(text_of(f"modes-{name}", **values) for name in ("measured", "best", "overlap")
+              if values),
+            *_of_the_others(measured),
+            *_of_graded(measured),
+            *_not_observable_text(ran),
+            *_of_strains(ran),
+        ],
+        keys=[KeyNumber.of(name, **values) for name in
+              ("waves-off", "a1-off", "overlap", "largest-error") if values],
         figures=_figures(measured, sizes, found.folder),
         words={"seeds": seeds.capitalize()},
         tables=[
@@ -202,7 +211,7 @@ def report_modes(found: ModesAnalysis, seeds: str) -> Findings:
             ReportTable.of("overlaps", measured.to_dict("records")),
         ],
         attachments=[ReportTable.of_frame("Every parameter", parameters_table(measured))],
-    )
+    )  # fmt: skip
 
 
 def _percent(values: Any) -> str:
@@ -216,50 +225,24 @@ def _between(values: pd.Series) -> str:
     return " to ".join(ends)
 
 
-def _keys(sizes: pd.DataFrame) -> list[KeyNumber]:
-    if not len(sizes):
-        return []
-    off, ratio = deviations(sizes), sizes["ratio"]
-    values = {
-        "waves-off": _percent(off[WAVE_VECTORS]),
-        "a1-off": _percent(off["a1"]),
-        "overlap": f"{sizes['overlap_lattice'].min():.4f}",
-        "largest-error": number(float(sizes["measurement_error_px"].max())),
-    }
-    ends = {"least": ratio.min(), "most": ratio.max()}
-    return [KeyNumber.of(name, value, **ends) for name, value in values.items()]
-
-
-def _text(found: ModesAnalysis) -> list[str]:
-    """What was found, the most important first."""
-    ran, measured, sizes = found.ran, found.measured, found.sizes
-    return [
-        *(_of_sizes(sizes) if len(sizes) else []),
-        *_of_the_others(measured),
-        *_of_graded(measured),
-        *_not_observable_text(ran),
-        *_of_strains(ran),
-    ]
-
-
-def _of_sizes(sizes: pd.DataFrame) -> list[str]:
-    apart, errors = standardised_errors(sizes), sizes["measurement_error_px"]
-    specimens = "1 specimen" if len(sizes) == 1 else f"{len(sizes)} specimens"
+def _of_sizes(sizes: pd.DataFrame) -> dict[str, object]:
+    """What texts and key numbers say of the specimens that differ in d/l."""
+    apart, errors, ratio = standardised_errors(sizes), sizes["measurement_error_px"], sizes["ratio"]
+    overlaps = [key for columns in list(_OVERLAPS.values())[:2] for key in columns]
 
     def off(prefix: str = "") -> dict[str, str]:
         found = deviations(sizes, prefix)
         return {"waves": _percent(found[WAVE_VECTORS]), "a1": _percent(found["a1"]),
                 "phases": _percent(found[["a6", "a7"]])}  # fmt: skip
 
-    overlaps = [key for columns in list(_OVERLAPS.values())[:2] for key in columns]
-    return [
-        text_of("modes-measured", specimens=specimens, least=sizes["ratio"].min(),
-                 most=sizes["ratio"].max(), **off()),
-        text_of("modes-best", least=number(float(errors.min())), most=number(float(errors.max())),
-                 within=int((np.abs(apart) <= 2).sum()), count=apart.size,
-                 rms=np.sqrt((apart**2).mean()), **off("best_")),
-        text_of("modes-overlap", **{key: _between(sizes[key]) for key in overlaps}),
-    ]  # fmt: skip
+    return {
+        "specimens": "1 specimen" if len(sizes) == 1 else f"{len(sizes)} specimens",
+        "least": ratio.min(), "most": ratio.max(), "measured": off(), "best": off("best_"),
+        "least_error": errors.min(), "most_error": errors.max(),
+        "within": (np.abs(apart) <= 2).sum(), "count": apart.size,
+        "rms": np.sqrt((apart**2).mean()), "least_overlap": sizes["overlap_lattice"].min(),
+        **{key: _between(sizes[key]) for key in overlaps},
+    }  # fmt: skip
 
 
 def _of_the_others(measured: pd.DataFrame) -> list[str]:
@@ -286,9 +269,8 @@ def _of_graded(measured: pd.DataFrame) -> list[str]:
     return [text_of(
         "modes-graded", least=part["smallest_ratio"].min(), most=part["largest_ratio"].max(),
         waves=_percent(deviations(part)[WAVE_VECTORS]), overlap=_between(part["overlap_truth"]),
-        worst=part.loc[part["overlap_truth"].idxmin()], base=base["overlap_truth"].iloc[0],
-        error=number(float(part["model_error_px"].max())),
-        base_error=number(float(base["model_error_px"].iloc[0])),
+        worst=part.loc[part["overlap_truth"].idxmin()], base=base.iloc[0],
+        error=part["model_error_px"].max(),
     )]  # fmt: skip
 
 
