@@ -26,7 +26,16 @@ from modeharvest.report.experiment import (
     snapshot_panels,
 )
 from modeharvest.report.figures import fits
-from modeharvest.report.model import Measured, draw_figures, fixed, number, print_report, write_page
+from modeharvest.report.model import (
+    KeyNumber,
+    Measured,
+    draw_figures,
+    fixed,
+    number,
+    print_report,
+    text_of,
+    write_page,
+)
 
 
 def report(data: ExperimentData, folder: Path, summary: dict[str, Any]) -> str:
@@ -55,6 +64,14 @@ def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
 def without_mesh(modes: int) -> list[fits.Panel[SnapshotState]]:
     """The panels of a run that does not measure the whole displacement."""
     return [panel for panel in snapshot_panels(modes) if panel.section != "whole"]
+
+
+def test_texts_write_numbers_for_a_reader() -> None:
+    row = {"nominal_strain": 0.128, "branch_N": 1.23456e-5, "unstable_N": 2.0}
+    words = text_of("experiment-energy", **row)
+    assert words.startswith("At 12.8\u00a0% the buckled state stores an energy of 1.2 · 10⁻⁵ N·mm")
+    key = KeyNumber.of("cutoff", last={"cutoff_px": 12.3456})
+    assert (key.name, key.value, key.unit) == ("cut-off wavelength", "12.3", "px")
 
 
 def test_every_panel_is_there_for_every_snapshot(text: str) -> None:

@@ -15,10 +15,10 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.report.figures import fits, style
+from modeharvest.report.figures import fits
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import draw_eigenvalues, draw_load
-from modeharvest.report.figures.maps import ColourScale, draw_blend, draw_field, draw_image
+from modeharvest.report.figures.maps import ColourScale, draw_field, draw_image
 from modeharvest.report.figures.whole_field import WholeMaps, whole_panel_numbers
 from modeharvest.report.model import (
     Card,
@@ -129,11 +129,9 @@ def draw_hero(state: SnapshotState) -> Figure:
         length = fits.UM * lengths(pattern_field(state.result, map_frame.grid))
     else:
         length = map_frame.average(fits.UM * lengths(state.comparison.w))
-    end = ColourScale.size(state.view.on_material(length), "µm")
-    return draw_blend(
-        map_frame, images.deformed(strain), images.deformed_mask(strain), images.grid, length,
-        ColourScale(style.GLOW, 0.0, end.high, "µm"), state.motion,
-    )  # fmt: skip
+    return fits.draw_dissolving(
+        state, images.deformed(strain), images.deformed_mask(strain), length
+    )
 
 
 def _image(state: SnapshotState) -> Figure:

@@ -87,7 +87,8 @@ def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> MeshB
         rounded = approximate_polygon(contour, _TOLERANCE)  # type: ignore[no-untyped-call]
         corners = rounded[:-1] - 1.0
         x, y = cells.to_mm(corners[:, 0], corners[:, 1])
-        if len(corners) < 3 or _polygon_area(x, y) <= least:
+        area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+        if len(corners) < 3 or area <= least:
             continue
         first = count + np.arange(len(corners))
         loops.append(np.stack([first, first, np.roll(first, -1)], axis=1))
@@ -102,10 +103,6 @@ def block_means(field: NDArray[Any], side: int) -> FloatArray:
     # Rows first, which is several times faster.
     whole = field[: rows * side].reshape(rows, side, -1).sum(axis=1, dtype=np.float64)
     return np.asarray(whole[:, : cols * side].reshape(rows, cols, side).sum(axis=2) / side**2)
-
-
-def _polygon_area(x: FloatArray, y: FloatArray) -> float:
-    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
 
 _SPARE = 0.15  # of the window: how much further the copies reach, for what a deformation brings in

@@ -13,17 +13,20 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.report.figures import style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import draw_convergence, draw_density, pattern_density
 from modeharvest.report.figures.maps import (
     ColourScale,
     DisplacementFunction,
     MapFrame,
+    draw_blend,
     draw_field,
     draw_shape,
 )
@@ -177,6 +180,19 @@ def draw_length(
     """Draw a length [mm] on a map in the deformed configuration, colours up to this share."""
     scale = ColourScale.size(UM * length, "µm", share)
     return draw_field(state.view.map_frame(cells), UM * length, scale, state.motion)
+
+
+def draw_dissolving(
+    state: FittedState, image: NDArray[np.float32], material: BoolArray | None, length: FloatArray
+) -> Figure:
+    """Let a state's image dissolve into the length [µm] of what was measured in it.
+
+    ``image``, ``material``: as for :func:`~modeharvest.report.figures.maps.draw_image`.
+    """
+    end = ColourScale.size(state.view.on_material(length), "µm").high
+    scale = ColourScale(style.GLOW, 0.0, end, "µm")
+    frame, grid = state.view.map_frame(), state.view.grid
+    return draw_blend(frame, image, material, grid, length, scale, state.motion)
 
 
 def _spectrum(state: FittedState, component: int) -> Figure:

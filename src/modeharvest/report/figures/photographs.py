@@ -117,12 +117,8 @@ def draw_hero(state: PhotographState) -> Figure:
     pattern = result.displacement(map_frame.grid)
     if state.frame.modes:
         pattern = pattern - result.v0(map_frame.grid)
-    length = UM * np.linalg.norm(pattern, axis=-1)
-    end = ColourScale.size(state.view.on_material(length), "µm")
-    drawn = maps.draw_blend(
-        map_frame, grey_levels(state.frame.image, state.levels), None, state.view.grid, length,
-        ColourScale(style.GLOW, 0.0, end.high, "µm"), state.motion,
-    )  # fmt: skip
+    image = grey_levels(state.frame.image, state.levels)
+    drawn = fits.draw_dissolving(state, image, None, UM * np.linalg.norm(pattern, axis=-1))
     # The photograph ends where the measured boundary does: a mask of it may have ragged edges.
     axes = drawn.axes[0]
     axes.images[0].set_clip_path(axes.patches[0])
@@ -358,7 +354,7 @@ def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Lin
     (i0, j0), (i1, j1) = lattice.index.min(axis=0), lattice.index.max(axis=0)
     ends = [((i, j0), (i, j1)) for i in range(i0, i1 + 1)]
     ends += [((i0, j), (i1, j)) for j in range(j0, j1 + 1)]
-    lines = [np.stack(_to_mm(lattice.position(pair), grid), axis=1) for pair in ends]
+    lines = [np.stack(grid.to_mm(*lattice.position(pair).T), axis=1) for pair in ends]
     axes.add_collection(LineCollection(lines, colors=BLUE, linewidths=0.7, alpha=0.9))
     handles = [Line2D([], [], color=BLUE, lw=1.0, label="lattice")]
     kinds = (
@@ -368,11 +364,7 @@ def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Lin
     )
     for at, marker, colour, name in kinds:
         if len(at):
-            dots = axes.plot(*_to_mm(at, grid), marker, color=colour, ms=3.0, mew=1.0, ls="none",
+            dots = axes.plot(*grid.to_mm(*at.T), marker, color=colour, ms=3.0, mew=1.0, ls="none",
                              label=name)  # fmt: skip
             handles += dots
     return handles
-
-
-def _to_mm(at: FloatArray, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
-    return grid.to_mm(at[..., 0], at[..., 1])
