@@ -40,21 +40,21 @@ def by_level(found: SystematicAnalysis) -> pd.DataFrame:
         if at_base is not None:
             parts[float(at_base)] = base
         for level in sorted(parts):
-            part = parts[level]
+            part, factor = parts[level], FACTORS[name]
             if not len(part):
                 continue
-            factor = FACTORS[name]
-            row = {"factor": factor.label, "name": name, "number": level,
-                   "level": factor.label_of(level) if factor.names else level,
-                   "base": "yes" if level == at_base else ""}  # fmt: skip
-            for key, label in ERROR_LABELS.items():
-                row[label] = part[key].mean()
-            row[MOVED] = part["moved"].mean()
+            good = int((part["outcome"] == "converged").sum())
             scatter = part["measurement_error_px"].std(ddof=0)
-            row["measurement error, sd over speckles [px]"] = scatter
-            row["pixels per ligament"] = part["pixels_per_ligament"].mean()
-            row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
-            rows.append(row)
+            rows.append({
+                "factor": factor.label, "name": name, "number": level,
+                "level": factor.label_of(level) if factor.names else level,
+                "base": "yes" if level == at_base else "",
+                **{label: part[key].mean() for key, label in ERROR_LABELS.items()},
+                MOVED: part["moved"].mean(),
+                "measurement error, sd over speckles [px]": scatter,
+                "pixels per ligament": part["pixels_per_ligament"].mean(),
+                "converged": f"{good} of {len(part)}",
+            })  # fmt: skip
     return pd.DataFrame(rows)
 
 

@@ -51,13 +51,10 @@ class SpecimenView:
     """The images' pixels, and (rows, cols) which of the reference's show material."""
     pitch: float
     """Unit cell size l [mm]."""
-    _frames: dict[int, MapFrame] = field(default_factory=dict, repr=False)
 
     def map_frame(self, cells: int = SMOOTH) -> MapFrame:
         """The frame of maps with about that many cells along the longer side."""
-        if cells not in self._frames:
-            self._frames[cells] = MapFrame.of(self.boundary, self.grid, cells)
-        return self._frames[cells]
+        return MapFrame.of(self.boundary, self.grid, cells)
 
     def on_material(self, values: FloatArray, cells: int = SMOOTH) -> FloatArray:
         """Values on a map; NaN off the material, where the ansatz has no meaning."""
