@@ -32,7 +32,6 @@ from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.report.grades import star_report, write_grading
 from modeharvest.report.model import print_report
-from modeharvest.validation.scoring.attenuation import Attenuation
 from modeharvest.validation.scoring.star import (
     Star,
     StarSet,
@@ -40,7 +39,12 @@ from modeharvest.validation.scoring.star import (
     image_name,
     make_star_set,
 )
-from modeharvest.validation.scoring.star_grades import StarGrade, StarGrading, ranked_grades
+from modeharvest.validation.scoring.star_grades import (
+    Attenuation,
+    StarGrade,
+    StarGrading,
+    ranked_grades,
+)
 from modeharvest.validation.studies.transfer import finest_period
 
 FloatArray = NDArray[np.float64]

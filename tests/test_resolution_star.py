@@ -22,7 +22,6 @@ from modeharvest.report.model import number
 from modeharvest.runs.benchmark import grade_star
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
-from modeharvest.validation.scoring.attenuation import Attenuation
 from modeharvest.validation.scoring.benchmark import Declared
 from modeharvest.validation.scoring.star import (
     Star,
@@ -32,7 +31,12 @@ from modeharvest.validation.scoring.star import (
     fine_speckle,
     make_star_set,
 )
-from modeharvest.validation.scoring.star_grades import NoiseFloor, StarGrade, ranked_grades
+from modeharvest.validation.scoring.star_grades import (
+    Attenuation,
+    NoiseFloor,
+    StarGrade,
+    ranked_grades,
+)
 from modeharvest.validation.studies.transfer import affine_subset_transfer, finest_period
 
 FloatArray = NDArray[np.float64]

@@ -194,7 +194,7 @@ def read_field(
     don't agree.
 
     path : CSV, TXT, NPZ, HDF5 or MAT with x, y, u and v: points (n,), grids (rows, cols), or x
-        (cols,) and y (rows,) as axes of grids u and v.
+        (cols,) and y (rows,) as axes of grids u and v; VTK or VTU with a vector at its points.
     grid : Pixels to millimetres, needed if anything is in pixels.
     units : "px" or "mm", of positions and displacements; None: as the columns' names state.
     displacement_units : Of u and v, if they are not those of x and y.

@@ -1,4 +1,4 @@
-"""Named columns of CSV, NPZ, HDF5 and MAT files, and the meaning of the names of DIC codes.
+"""Named columns of CSV, NPZ, HDF5, MAT and VTK files, and the meaning of the names of DIC codes.
 
 Known: x, y, u, v with or without a unit, the lower and upper case of VIC-2D and VIC-3D (pixels and
 millimetres), DICe's COORDINATE_X and DISPLACEMENT_X, pyvale's subset_x and disp_u, GOM's and
@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from modeharvest.fem.field import read_any_mesh
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import open_hdf5, read_in_child, reading, require_plausible
@@ -26,6 +27,8 @@ from modeharvest.util.machine import require_memory
 
 Table = dict[str, FloatArray]
 
+TEXTS = (".csv", ".txt", ".dat", ".tsv")
+_VECTORS = ("u", "displacement", "disp", "displacements")
 _MISSING = {"", "-", "--", "---", "na", "n/a", "nan", "null", "none"}
 _WHAT, _REMEDY = "a displacement field", "export it again, best as CSV"
 _BYTES_OF_TEXT = 10.0
@@ -39,8 +42,9 @@ def read_table(path: Path | str) -> Table:
     """Read all the numeric variables of a file, each under its name.
 
     ``.csv``, ``.txt``, ``.dat`` or ``.tsv`` with columns; ``.npz``; ``.h5`` or ``.hdf5``; ``.mat``
-    of any version. Variables in groups or structures are found by their last name. Raises
-    InputError if the file is missing, not of its kind, or holds no numbers.
+    of any version; ``.vtk``, ``.vtu`` or ``.vtp`` with a vector named u or displacement at its
+    points. Variables in groups or structures are found by their last name. Raises InputError if the
+    file is missing, not of its kind, or holds no numbers.
     """
     path = Path(path)
     with reading(path, f"{_WHAT} ({path.suffix})", _REMEDY):
@@ -177,6 +181,20 @@ def read_mat(path: Path) -> dict[str, NDArray[Any]]:
     return read_in_child("mat", path, "a MAT file", _REMEDY)
 
 
+def _read_vtk(path: Path) -> Table:
+    """Positions x and y, and a vector at them as u and v."""
+    mesh = read_any_mesh(path)
+    vectors = {n: v for n, v in mesh.point_data.items() if v.ndim == 2 and v.shape[1] in (2, 3)}
+    named = [name for name in vectors if name.lower() in _VECTORS] or list(vectors)
+    if len(named) != 1:
+        raise InputError(
+            f"{path}: expected one vector at the points, named u or displacement, got "
+            f"{', '.join(map(repr, mesh.point_data)) or 'none'}"
+        )
+    (x, y), (u, v) = mesh.points[:, :2].T, vectors[named[0]][:, :2].T
+    return _numeric({"x": x, "y": y, "u": u, "v": v})
+
+
 def _by_last_name(found: dict[str, Any]) -> dict[str, Any]:
     """Short names where they are unique; whole paths where they are not."""
     last = [path.rsplit("/", 1)[-1] for path in found]
@@ -197,10 +215,11 @@ def _numeric(found: dict[str, Any]) -> Table:
 
 
 _READERS: dict[str, Callable[[Path], Table]] = {
-    **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), _read_text),
+    **dict.fromkeys(TEXTS, _read_text),
     **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
     ".npz": _read_npz,
     ".mat": _read_mat,
+    **dict.fromkeys((".vtk", ".vtu", ".vtp"), _read_vtk),
 }
 
 

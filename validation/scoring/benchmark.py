@@ -13,7 +13,6 @@ loading or imperfection that it could be computed from. The set's id is a digest
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -27,10 +26,10 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from modeharvest.fem.field import Solution, read_any_mesh
+from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.local.field import LocalField, read_field
-from modeharvest.idic.local.tables import read_mat
+from modeharvest.idic.local.tables import TEXTS, read_mat
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.mapping.isoparametric import interpolate, locate, locate_points
@@ -57,7 +56,7 @@ _README = resources.files(__package__).joinpath("readme.txt").read_text("utf-8")
 
 def readme(info: Mapping[str, Any]) -> str:
     """The README of a set, Markdown, from the content of its ``benchmark.json``."""
-    first, reference, camera = info["first_pixel_mm"], info["reference"], f"{info['bits']} bit"
+    reference, camera = info["reference"], f"{info['bits']} bit"
     rows = [
         f"| `{reference['image']}` | undeformed, float, {info['rows']} × {info['cols']} px |",
         f"| `{reference['camera_image']}` | undeformed, {camera} |",
@@ -67,14 +66,7 @@ def readme(info: Mapping[str, Any]) -> str:
         strain = f"nominal strain {100 * entry['nominal_strain']:g} %"
         rows += [f"| `{entry['image']}` | {strain}, float |",
                  f"| `{entry['camera_image']}` | {strain}, {camera} |"]  # fmt: skip
-    derived = {
-        "mask": reference["mask"],
-        "files": "\n".join(rows),
-        "strain": info["deformed"][-1]["nominal_strain"],
-        "x0": first["x"],
-        "y0": first["y_up"],
-    }
-    return _README.format_map({**info, **derived})
+    return _README.format(table="\n".join(rows), last=info["deformed"][-1], **info)
 
 
 FORMAT, TRUTH_FORMAT = "modeharvest-benchmark-1", "modeharvest-benchmark-truth-1"
@@ -149,9 +141,17 @@ def displacement_at(
     return np.ascontiguousarray(u[:, 0].T)
 
 
-def set_id(files: Mapping[str, Any]) -> str:
-    """The id of a set: a digest of its files' sizes and digests."""
-    return digest(files)[:12]
+def set_record(form: str, files: Mapping[str, Any], **content: Any) -> dict[str, Any]:
+    """What a public set says of itself; its id is a digest of its files' sizes and digests."""
+    return {
+        "format": form,
+        "id": digest(files)[:12],
+        "licence": "CC-BY-4.0",
+        "made_with": f"modeharvest {__version__}",
+        **content,
+        "returned": RETURNED,
+        "files": dict(files),
+    }
 
 
 def publish(
@@ -230,23 +230,19 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
                 "make the images again with 'modeharvest image'"
             )
     grid = images.grid
-    info = {
-        "format": FORMAT,
-        "id": set_id(files),
-        "licence": "CC-BY-4.0",
-        "made_with": f"modeharvest {__version__}",
-        "rows": grid.rows,
-        "cols": grid.cols,
-        "pixel_size_mm": grid.pixel_size,
-        "first_pixel_mm": {"x": grid.x0, "y_up": grid.y0},
-        "unit_cell_mm": specimen.pitch,
-        "bits": images.spec.bits,
-        "background": images.spec.background,
-        "reference": reference,
-        "deformed": deformed,
-        "returned": RETURNED,
-        "files": files,
-    }
+    info = set_record(
+        FORMAT,
+        files,
+        rows=grid.rows,
+        cols=grid.cols,
+        pixel_size_mm=grid.pixel_size,
+        first_pixel_mm={"x": grid.x0, "y_up": grid.y0},
+        unit_cell_mm=specimen.pitch,
+        bits=images.spec.bits,
+        background=images.spec.background,
+        reference=reference,
+        deformed=deformed,
+    )
     with disk.atomic(public / README) as part:
         part.write_text(readme(info), "utf-8")
     return info
@@ -270,15 +266,11 @@ def _is_whole(public: Path, truth: Path, images: ImageSet) -> bool:
 
 # -- fields measured on a set ----------------------------------------------------------
 
-_VTK = {".vtk", ".vtu", ".vtp"}
-_TEXT = {".csv", ".txt", ".dat", ".tsv"}
-_KINDS = {*_TEXT, ".npz", ".h5", ".hdf5", ".mat", *_VTK}
 _OPTIONS = {
     "give units='px' or 'mm'": "give --unit px or mm",
     "give y_axis='up' or 'down'": "give --y-axis up or down",
     "name them in columns": "say which of them by --column, as u=disp_x",
 }
-_VECTORS = ("u", "displacement", "disp", "displacements")
 _ID = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 
 
@@ -303,25 +295,21 @@ def read_measured(
 ) -> LocalField:
     """Read a field to be graded.
 
-    ``path``: CSV, NPZ, HDF5, MAT; VTK or VTU with a vector named u or displacement at its points;
-    ``grid``, ``benchmark``: the benchmark's pixels, and its id. InputError if it can't be read, or
-    says that it is of another benchmark.
+    ``path``: of any kind that :func:`~modeharvest.idic.local.field.read_field` reads; ``grid``,
+    ``benchmark``: the benchmark's pixels, and its id. InputError if it can't be read, or says that
+    it is of another benchmark.
     """
     path, how = Path(path), asdict(declared or Declared())
     name = how.pop("name") or path.stem
     disk.require_file(path, "a displacement field", "check its name")
-    if path.suffix.lower() not in _KINDS:
-        known, got = ", ".join(sorted(_KINDS)), path.suffix
-        raise InputError(f"{path}: expected one of {known}, got {got!r}; save the field as CSV")
     claimed = claimed_benchmark(path)
     if claimed not in (None, benchmark):
         raise InputError(
             f"{path}: expected a field of benchmark {benchmark}, but it says that it is of "
             f"{claimed}; take the truth of that one"
         )
-    read = _read_vtk if path.suffix.lower() in _VTK else read_field
     try:
-        return replace(read(path, grid, **how), source=name)
+        return replace(read_field(path, grid, **how), source=name)
     except InputError as error:
         message = str(error)
         for argument, option in _OPTIONS.items():
@@ -333,7 +321,7 @@ def claimed_benchmark(path: Path) -> str | None:
     """The id that a file itself says it belongs to; None if it says none or can't be read."""
     suffix, text, what = path.suffix.lower(), "", "a displacement field"
     with suppress(InputError), disk.reading(path, what):  # who reads the field says what is wrong
-        if suffix in _TEXT:
+        if suffix in TEXTS:
             with path.open(encoding="utf-8", errors="replace") as file:
                 text = "".join(line for line in islice(file, 50) if line[0] in "#%")
         elif suffix == ".npz":
@@ -346,28 +334,3 @@ def claimed_benchmark(path: Path) -> str | None:
             text = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
     found = _ID.search(text)
     return found.group(1).lower() if found else None
-
-
-def _read_vtk(path: Path, grid: PixelGrid, **how: Any) -> LocalField:
-    """By way of a table of columns, so that units and axes are declared as for any file."""
-    with disk.reading(path, f"a displacement field ({path.suffix})", "save it as CSV"):
-        mesh = read_any_mesh(path)
-        vectors = {
-            name: np.asarray(values, dtype=np.float64)
-            for name, values in mesh.point_data.items()
-            if np.ndim(values) == 2 and np.shape(values)[1] in (2, 3)
-        }
-    named = [name for name in vectors if name.lower() in _VECTORS] or list(vectors)
-    if len(named) != 1:
-        raise InputError(
-            f"{path}: expected one vector at the points, named u or displacement, got "
-            f"{', '.join(map(repr, mesh.point_data)) or 'none'}"
-        )
-    (x, y), (u, v) = mesh.points[:, :2].T, vectors[named[0]][:, :2].T
-    with tempfile.TemporaryDirectory() as folder:
-        table = Path(folder) / f"{path.stem}.npz"
-        np.savez(table, x=x, y=y, u=u, v=v)
-        try:
-            return read_field(table, grid, **how)
-        except InputError as error:
-            raise InputError(str(error).replace(str(table), str(path))) from error

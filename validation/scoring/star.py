@@ -33,7 +33,6 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
-from modeharvest.util import __version__
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_record, reading, sha256_of, write_json
@@ -41,7 +40,7 @@ from modeharvest.util.machine import require_memory
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import Stages, stage_key
 from modeharvest.util.typed import made
-from modeharvest.validation.scoring.benchmark import RETURNED, set_id
+from modeharvest.validation.scoring.benchmark import set_record
 
 KEPT = 0.9
 """Share of the amplitude that comes back at the finest period: an attenuation of 10 % [-]."""
@@ -189,6 +188,7 @@ class StarSet:
 
     folder: Path
     spec: StarSpec
+    id: str
     info: Mapping[str, Any]
 
     @classmethod
@@ -198,12 +198,7 @@ class StarSet:
         what, remedy = "a star set", "'modeharvest benchmark star' makes one"
         with reading(path, what, remedy):
             info = read_record(path, FORMAT, what, remedy)
-            return cls(Path(folder), made(StarSpec, info["spec"]), info | {"id": str(info["id"])})
-
-    @property
-    def id(self) -> str:
-        """Of the set."""
-        return str(self.info["id"])
+            return cls(Path(folder), made(StarSpec, info["spec"]), str(info["id"]), info)
 
 
 def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silent) -> StarSet:
@@ -249,19 +244,14 @@ def _images(spec: StarSpec, f: FloatImage, g: FloatImage) -> Iterator[tuple[str,
 
 def star_readme(info: Mapping[str, Any]) -> str:
     """The README of a set, Markdown, from the content of its ``star.json``."""
-    star, bits, rows = info["spec"]["star"], info["spec"]["bits"], []
+    star, bits, rows = Star(**info["spec"]["star"]), info["spec"]["bits"], []
     for name in info["files"]:
         role, _, level = name.removesuffix(".tif").partition("_")
         percent = level.removesuffix("pct").replace("p", ".")
         kind = f"{bits} bit, noise {percent} % of full scale" if level else "exact, float"
         rows.append(f"| `{name}` | {_ROLES[role]}; {kind} |")
-    derived = {
-        "files": "\n".join(rows),
-        "range": star["longest_px"] - star["shortest_px"],
-        "last": star["cols"] - 1,
-        "centre": star["rows"] // 2,
-    }
-    return _README.format_map({**info, **info["law"], **star, **derived})
+    longer, last = star.longest_px - star.shortest_px, star.cols - 1
+    return _README.format(star=star, longer=longer, last=last, table="\n".join(rows), **info)
 
 
 def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[str, Any]:
@@ -275,13 +265,4 @@ def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[
         "of": "points of the reference image; the centre of the upper left pixel is (0, 0)",
         "residual_of_inversion_px": residual_px,
     }
-    return {
-        "format": FORMAT,
-        "id": set_id(files),
-        "licence": "CC-BY-4.0",
-        "made_with": f"modeharvest {__version__}",
-        "law": law,
-        "spec": asdict(spec),
-        "returned": RETURNED,
-        "files": dict(files),
-    }
+    return set_record(FORMAT, files, law=law, spec=asdict(spec))

@@ -1,4 +1,11 @@
-"""Grades on the star: finest period, noise floor, metrological efficiency indicator.
+"""Grades on the star: attenuation, noise floor, and the metrological efficiency indicator.
+
+At every column the returned displacements are set against the true ones by least squares through
+the origin: their slope is the share of the wave that is left, T. Along the centre row alone that is
+the measured over the true amplitude, as in the DIC Challenge; other rows, up to half a period away,
+make it less noisy. Over the columns T is smoothed by local quadratic regression in the logarithm
+of the period. A smoothed value's standard error comes from the scatter of the columns about the
+curve, neighbours as dependent as their autocorrelation.
 
     l10    the period at which 10 % of the amplitude are lost [px]
     n      standard deviation of v between two images without motion [px]
@@ -14,18 +21,220 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from modeharvest.idic.local.field import LocalField
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import headings, quantity, to_plain
-from modeharvest.validation.scoring.attenuation import Attenuation
 from modeharvest.validation.scoring.star import KEPT, Star, StarSet
 
 RESOLUTION_FORMAT = "modeharvest-resolution-1"
+_WIDTH = 0.35
+"""Half width of the local regression, in the logarithm of the period."""
+_FEWEST_COLUMNS = 20
+"""In a local regression, and for a field to be graded at all."""
+_POINTS = 240
+"""Periods of the curve."""
+_SPAN = 3.0
+"""Ratio of the longest to the shortest period that a field has to cover at least."""
+_NO_MORE = 0.05
+"""An autocorrelation below this ends the memory."""
+_CHALLENGE_DEGREE = 12
+"""Of the polynomial that the DIC Challenge smooths its centre row with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """T at every column of a field, (m,) each, by ascending period."""
+
+    period: FloatArray
+    """Of the wave there [px]."""
+    share: FloatArray
+    """T [-]."""
+    weight: FloatArray
+    """Sum of the squared true displacements that T rests on [px^2]."""
+
+    @classmethod
+    def of(cls, star: Star, field: LocalField, rows: BoolArray) -> Columns:
+        """From the valid points of a field (in px, on the star's grid) that ``rows`` (n,) names."""
+        used = field.good & rows
+        x, y, v = field.x[used], field.y[used], field.u[used, 1]
+        true = star.displacement(x, y)[:, 1]
+        column, at = np.unique(np.rint(x).astype(int), return_inverse=True)
+        both, square = (
+            np.asarray(np.bincount(at, values), np.float64) for values in (v * true, true * true)
+        )
+        enough = square > 0.25 * star.amplitude_px**2
+        period = star.period(column[enough])
+        return cls(period, both[enough] / square[enough], square[enough])
+
+
+@dataclass(frozen=True, eq=False)
+class Attenuation:
+    """A field's curve T over the period."""
+
+    columns: Columns
+    """From all rows within half a period of the centre."""
+    centre: Columns
+    """From the centre row, or the row next to it, alone."""
+
+    @classmethod
+    def of(cls, star: Star, field: LocalField) -> Attenuation:
+        """Of a field in px on the star's grid; InputError if columns are few or have no wave."""
+        with np.errstate(invalid="ignore"):
+            inside = (field.x >= -0.5) & (field.x <= star.cols - 0.5)
+            near = inside & (np.abs(field.y) <= 0.5 * star.period(field.x))
+            row = np.abs(field.y).min(where=field.good, initial=np.inf)
+            middle = inside & (np.abs(field.y) <= row + 0.5)
+        columns = Columns.of(star, field, near)
+        _require_star(columns, star, field)
+        return cls(columns, Columns.of(star, field, middle))
+
+    @cached_property
+    def period(self) -> FloatArray:
+        """(n,) periods of the curve [px]."""
+        first, last = self.columns.period[[0, -1]]
+        return np.asarray(np.geomspace(first, last, _POINTS))
+
+    @cached_property
+    def curve(self) -> tuple[FloatArray, FloatArray]:
+        """(n,) smoothed T and its standard error [-] at ``period``; NaN where columns are few."""
+        return _smoothed(self.columns, self.period)
+
+    @cached_property
+    def finest_px(self) -> float:
+        """l10: the shortest period at which T rises through 0.9 [px]; NaN if it never does."""
+        return first_rise(self.period, self.curve[0])
+
+    @cached_property
+    def finest_se_px(self) -> float:
+        """Standard error of :attr:`finest_px` [px]."""
+        share, error = self.curve
+        slope = np.gradient(share, self.period)
+        known = np.isfinite(slope) & np.isfinite(error)
+        if not np.isfinite(self.finest_px):
+            return float("nan")
+        at = [np.interp(self.finest_px, self.period[known], a[known]) for a in (error, slope)]
+        return float(at[0] / abs(at[1]))
+
+    @cached_property
+    def safe_px(self) -> float:
+        """The period from which on T stays above 0.9 [px]; NaN if there is none."""
+        period, share = self._known
+        below = np.flatnonzero(share < KEPT)
+        if not len(below) or below[-1] == len(share) - 1:
+            return float("nan")
+        return first_rise(period[below[-1] :], share[below[-1] :])
+
+    @cached_property
+    def challenge_px(self) -> float:
+        """l10 as in the DIC Challenge: a polynomial of degree 12 through the centre row's T at 0.9.
+
+        NaN if it never is, or the row has too few points.
+        """
+        at, share = self.centre.period, self.centre.share
+        if len(at) <= 4 * _CHALLENGE_DEGREE:
+            return float("nan")
+        fit = np.polynomial.Chebyshev.fit(at, share, _CHALLENGE_DEGREE)
+        period = np.linspace(at[0], at[-1], 20 * _POINTS)
+        return first_rise(period, np.asarray(fit(period), dtype=np.float64))
+
+    @cached_property
+    def ripple(self) -> float:
+        """Rms of the centre row's T about the curve above l10 [-]: noise, pattern-induced bias."""
+        expected = np.interp(self.centre.period, self.period, self.curve[0])
+        long = self.centre.period > np.nan_to_num(self.finest_px, nan=0.0)
+        left = (self.centre.share - expected)[long]
+        return float(np.sqrt(np.nanmean(left**2))) if len(left) else float("nan")
+
+    def at(self, period: float) -> float:
+        """Smoothed T at a period [px]; NaN outside."""
+        return float(np.interp(period, *self._known, np.nan, np.nan))
+
+    @property
+    def _known(self) -> tuple[FloatArray, FloatArray]:
+        """Periods and T where there are columns enough for T."""
+        known = np.isfinite(self.curve[0])
+        return self.period[known], self.curve[0][known]
+
+
+def first_rise(period: FloatArray, share: FloatArray) -> float:
+    """The first period at which a curve rises through 0.9, linear between its points; or NaN."""
+    known = np.isfinite(share)
+    p, t = period[known], share[known]
+    rises = np.flatnonzero((t[:-1] < KEPT) & (t[1:] >= KEPT))
+    if not len(rises):
+        return float("nan")
+    k = rises[0]
+    return float(p[k] + (KEPT - t[k]) * (p[k + 1] - p[k]) / (t[k + 1] - t[k]))
+
+
+def _smoothed(columns: Columns, period: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Local quadratic regression of T in ln(period), and its standard errors."""
+    at = np.log(columns.period)
+    rows = np.array([_regression(at - t, columns.weight) for t in np.log(period)])
+    share = rows @ columns.share
+    known = np.isfinite(share)
+    left = columns.share - np.interp(columns.period, period[known], share[known])
+    return np.asarray(share), np.sqrt(_memory(left) * (rows**2 @ left**2))
+
+
+def _regression(offset: FloatArray, weight: FloatArray) -> FloatArray:
+    """(m,) what each column counts in the fitted value at offset 0; NaN where there are few."""
+    near = np.clip(1.0 - np.abs(offset / _WIDTH) ** 3, 0.0, None) ** 3 * weight
+    if np.count_nonzero(near) < _FEWEST_COLUMNS:
+        return np.full(offset.shape, np.nan)
+    basis = np.vander(offset / _WIDTH, 3, increasing=True)
+    weighted = basis * near[:, None]
+    return np.asarray(weighted @ np.linalg.pinv(basis.T @ weighted, hermitian=True)[0])
+
+
+def _memory(left: FloatArray) -> float:
+    """Correlation length of neighbouring columns: 1 + 2 sum of autocorrelations."""
+    size = np.sqrt(ndimage.uniform_filter1d(left**2, max(3, len(left) // 10)))
+    z = left / np.maximum(size, np.finfo(float).tiny)
+    lags = len(z) // 10
+    rho = np.array([np.mean(z[: len(z) - k] * z[k:]) for k in range(lags + 1)]) / np.mean(z**2)
+    ends = np.flatnonzero(rho < _NO_MORE)
+    return float(1.0 + 2.0 * rho[1 : ends[0] if len(ends) else None].sum())
+
+
+def _require_star(columns: Columns, star: Star, field: LocalField) -> None:
+    """Raise InputError unless the field covers enough of the wave and its longest part is there."""
+    if len(columns.period) < _FEWEST_COLUMNS:
+        raise InputError(
+            f"{field.source}: expected displacements at {_FEWEST_COLUMNS} columns or more within "
+            f"half a period of the centre row {star.centre_row}, got {len(columns.period)}; "
+            "measure about the centre row, all along the image"
+        )
+    first, last = columns.period[[0, -1]]
+    if last < _SPAN * first:
+        raise InputError(
+            f"{field.source}: expected columns over periods from {star.shortest_px:g} to "
+            f"{star.longest_px:g} px, got {first:.4g} to {last:.4g} px only; measure all along "
+            "the image"
+        )
+    long = columns.period >= np.sqrt(first * last)
+    share = float(np.average(columns.share[long], weights=columns.weight[long]))
+    if 0.5 < share < 1.5:
+        return
+    u, v = (float(np.sqrt(np.mean(field.u[field.good, c] ** 2))) for c in (0, 1))
+    why = "is it the field without motion, or of other images?"
+    if -1.5 < share < -0.5:
+        why = "v has the other sign: y_axis up or down?"
+    elif u > 3.0 * v:
+        why = "u and v look exchanged"
+    elif not 0.1 < abs(share) < 10.0 and v > 0.0:
+        why += " Or are displacements in another unit than px?"
+    raise InputError(
+        f"{field.source}: expected the star's wave of {star.amplitude_px:g} px along y, got "
+        f"{share:.3g} times it at periods above {columns.period[long][0]:.3g} px; {why}"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,8 +436,5 @@ class StarGrade:
 
 def ranked_grades(grades: Sequence[StarGrade]) -> list[StarGrade]:
     """The best first: by the indicator; then those without one, by l10."""
-
-    def key(grade: StarGrade) -> tuple[float, ...]:
-        return tuple(np.nan_to_num([grade.indicator_px2, grade.attenuation.finest_px], nan=np.inf))
-
-    return sorted(grades, key=key)
+    numbers = attrgetter("indicator_px2", "attenuation.finest_px")
+    return sorted(grades, key=lambda grade: tuple(np.nan_to_num(numbers(grade), nan=np.inf)))

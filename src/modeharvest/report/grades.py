@@ -30,7 +30,6 @@ from modeharvest.report.model import (
 )
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import atomic, write_json
-from modeharvest.validation.scoring.attenuation import Attenuation
 from modeharvest.validation.scoring.score import (
     COMMON,
     EVERYWHERE,
@@ -46,6 +45,7 @@ from modeharvest.validation.scoring.score import (
 from modeharvest.validation.scoring.star import KEPT
 from modeharvest.validation.scoring.star_grades import (
     GRADE_COLUMNS,
+    Attenuation,
     StarGrade,
     StarGrading,
     grade_numbers,
