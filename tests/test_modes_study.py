@@ -26,17 +26,13 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.validation.studies import modes as modes_specimen
 from modeharvest.validation.studies.lattice import EQ_MODE, ModeRow, PatternMode
-from modeharvest.validation.studies.modes import (
-    MeasuredModesStudy,
-    ModesAnalysis,
-    likeness,
-    one_specimen,
-)
+from modeharvest.validation.studies.modes import MeasuredModesStudy, likeness, one_specimen
 from modeharvest.validation.studies.modes_specimen import (
-    LatticeMode,
     PatternCells,
     SpecimenSpec,
     buckle,
+    nearest_aspect,
+    overlap_on_specimen,
 )
 from modeharvest.validation.studies.study import ImagePairSpec
 
@@ -59,13 +55,13 @@ def rectangle(half: tuple[float, float], count: tuple[int, int]) -> Mesh:
     return Mesh(nodes, first[:, None] + place @ [len(y), 1], "Q9")
 
 
-def lattice_mode(pitch: float, aspect: float = 1.0) -> LatticeMode:
+def mode_of(pitch: float, aspect: float = 1.0) -> PatternMode:
     """Eq. (mode) itself with a1 = ``aspect``, posing as a numerical mode."""
     mesh = rectangle((0.5 * pitch, 0.5 * pitch), (8, 8))
     ideal = wave_sum(EQ_MODE.waves(EQ_MODE.start), mesh.nodes, pitch)
     row = ModeRow("", "uniaxial", pitch, 0.79, 8, True, 0.074, "pattern", 0.074, 0.074, 0.0, 1.0,
                   1.0, 2)  # fmt: skip
-    return LatticeMode(PatternMode(row, mesh, ideal * [aspect, 1.0], ideal))
+    return PatternMode(row, mesh, ideal * [aspect, 1.0], ideal)
 
 
 # -- projections and overlaps -------------------------------------------------------------
@@ -97,17 +93,21 @@ def test_the_pattern_s_amplitude_is_seen_through_everything_else() -> None:
 
 def test_the_lattice_s_mode_lies_on_the_specimen_s_holes() -> None:
     """Eq. (mode) about a hole, copied to all of them, is Eq. (mode) about a junction."""
-    mode, family = lattice_mode(1.9), square_family("junction")
-    assert mode.overlap(SOLID, family, family.start) == pytest.approx(1.0, abs=1e-4)
+    mode, family = mode_of(1.9), square_family("junction")
+    assert overlap_on_specimen(mode, SOLID, family, family.start) == pytest.approx(1.0, abs=1e-4)
     tilted = family.start.copy()
     tilted[1] += 0.05  # over half of 4 cells a phase of 0.05 pi 2 = 0.3 rad
-    assert 0.9 < mode.overlap(SOLID, family, tilted) < 0.999
-    assert mode.overlap(SOLID, square_family("hole"), square_family("hole").start) < 0.01
-    assert mode.aspect == pytest.approx(1.0, abs=1e-12)
-    assert lattice_mode(1.9, 0.97).aspect == pytest.approx(0.97, abs=1e-12)
+    assert 0.9 < overlap_on_specimen(mode, SOLID, family, tilted) < 0.999
+    assert (
+        overlap_on_specimen(mode, SOLID, square_family("hole"), square_family("hole").start) < 0.01
+    )
+    assert nearest_aspect(mode) == pytest.approx(1.0, abs=1e-12)
+    assert nearest_aspect(mode_of(1.9, 0.97)) == pytest.approx(0.97, abs=1e-12)
     narrow = family.start.copy()
     narrow[0] = 0.97
-    assert lattice_mode(1.9, 0.97).overlap(SOLID, family, narrow) == pytest.approx(1.0, abs=1e-4)
+    assert overlap_on_specimen(mode_of(1.9, 0.97), SOLID, family, narrow) == pytest.approx(
+        1.0, abs=1e-4
+    )
 
 
 # -- specimens ----------------------------------------------------------------------------
@@ -154,7 +154,9 @@ def measured(subject: ImagePairSpec, tmp_path_factory: pytest.TempPathFactory) -
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(modes_specimen, "buckle", simulated)
         patch.setattr(
-            LatticeMode, "of", lambda specimen, material, divisions: lattice_mode(specimen.pitch)
+            modes_specimen,
+            "lattice_mode",
+            lambda specimen, material, divisions: mode_of(specimen.pitch),
         )
         cases = study.prepare(subject, folder)
         rows = [{**case, "error": "", **one_specimen(case, folder)}
@@ -215,14 +217,14 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
 
 
 def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:
-    _, table, folder = measured
+    study, table, folder = measured
     odd = table.copy()
     odd["unstable_pivots"] = odd["unstable_pivots"].astype(float)
     odd.loc[0, "unstable_pivots"] = 2.0
     odd.loc[1, ["first", "simulation"]] = ["other", "the branch could be followed to 0.1 l only"]
     odd.loc[1, "pattern_share"] = 0.2
     odd.loc[2, "outcome"] = "local_minimum"
-    said = " ".join(report_modes(ModesAnalysis.of(odd, folder), "seed 0").text)
+    said = " ".join(report_modes(study.analyse(odd, folder), "seed 0").text)
     assert "On 1 specimen with d/l" in said
     assert "base: measured in a state that is not stable" in said
     assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in said

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -154,11 +154,11 @@ def test_one_start_against_a_calculation_of_its_own(subject: ImagePairSpec, fold
     u, other = (r.displacement()[::4, ::4][scene.mask[::4, ::4]] / 0.05 for r in (home, end))
     norm, other_norm = np.linalg.norm(u), np.linalg.norm(other)
     epsilon = 100.0 * abs(norm - other_norm) / norm
-    assert found.epsilon_percent == pytest.approx(epsilon, rel=1e-6, abs=1e-12)
+    assert found["epsilon_percent"] == pytest.approx(epsilon, rel=1e-6, abs=1e-12)
     distance = np.linalg.norm(u - other) / np.sqrt(len(u))
-    assert found.distance_px == pytest.approx(distance, rel=1e-6, abs=1e-12)
-    assert found.distance_px < SAME_PX < found.start_distance_px
-    assert one_start(far, folder).start_distance_px > 1.0
+    assert found["distance_px"] == pytest.approx(distance, rel=1e-6, abs=1e-12)
+    assert found["distance_px"] < SAME_PX < found["start_distance_px"]
+    assert one_start(far, folder)["start_distance_px"] > 1.0
 
 
 # -- noise --------------------------------------------------------------------------------
@@ -239,8 +239,7 @@ def test_noise_study_on_tiny_images(
     study = NoiseStudy(levels=(0.002,), pairs=2)
     cases = study.prepare(subject, folder)
     assert len(cases) == 5
-    rows = [{**case, "error": "", **asdict(one_realisation(case, folder))}
-            for case in cases]  # fmt: skip
+    rows = [{**case, "error": "", **one_realisation(case, folder)} for case in cases]
     found = report_noise(study.analyse(pd.DataFrame(rows), folder), study.seeds)
     summary = frame(found.attachments, "Noise levels").set_index("quantity")
     # Eight of 77 x 4 errors' standard deviations: the bound to within a factor.
@@ -269,7 +268,7 @@ def test_systematic_study_on_tiny_images(subject: ImagePairSpec, folder: Path) -
     cases = study.prepare(subject, folder)  # the base leaves order and gradient to the images
     factors = ["base", *["order"] * 3, *["gradient"] * 2, *["bits"] * 2]
     assert [c["factor"] for c in cases] == factors
-    rows = [{**case, "error": "", **asdict(one_level(case, folder))} for case in cases]
+    rows = [{**case, "error": "", **one_level(case, folder)} for case in cases]
     kept = {
         VirtualImagePair.images_folder(folder, c["images"]).is_dir() for c in cases if c["keep"]
     }

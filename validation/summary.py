@@ -52,28 +52,39 @@ class BuckledEnergy:
 
 @dataclass(frozen=True)
 class ModeSummary:
-    """One of several modes: parameters as for a single one, rms of v_i phi_i per component."""
+    """A mode's parameters, of all equivalents the ones nearest to the ideal ones."""
 
     name: str
     names: tuple[str, ...]
     units: tuple[str, ...]
     found: tuple[float, ...]
     ideal: tuple[float, ...]
+    """The exact pattern with its origin on a solid junction."""
     standard_error: tuple[float | None, ...]
     model_error: tuple[float | None, ...]
+    """Standard errors of ``found``, by noise and by model error; the latter empty where the mode is
+    not observable."""
     best_fit: tuple[float, ...]
     amplitude_px: float
+    """Rms of v_i phi_i per component."""
     observable: bool
+
+
+_SINGLE = {"mode": "found", "mode_ideal": "ideal", "mode_standard_error": "standard_error",
+           "mode_model_error": "model_error", "mode_best_fit": "best_fit"}  # fmt: skip
+"""What ``summary.json`` calls the parameters of a single mode."""
+_OPTIONAL = {"gain_min", "gain_max", "offset_min", "offset_max", "mode_deviation_percent", "modes",
+             "whole_field"}  # fmt: skip
+"""What it leaves out where it was not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotSummary:
     """One strain of a virtual experiment; rms is per component.
 
-    Lengths of ``pattern_...`` are of v1 phi1, or of the sum over all ``modes``. The mode's
-    parameters are, of all equivalents, the ones nearest to ``mode_ideal``. Without free parameters
-    the lists are empty; without gain and offset as unknowns they are None, and so is what belongs
-    to noise for noise-free images.
+    Lengths of ``pattern_...`` are of v1 phi1, or of the sum over all ``modes``, which are empty
+    without free parameters. Without gain and offset as unknowns these are None, and so is what
+    belongs to noise for noise-free images.
     """
 
     nominal_strain: float
@@ -102,17 +113,9 @@ class SnapshotSummary:
     mode_polynomial_overlap: float = quantity("overlap of the mode's part with v₀", "–")
     outcome: str = quantity("outcome")
     outcome_why: str
-    mode: tuple[float, ...] = ()
-    mode_ideal: tuple[float, ...] = ()
-    """The exact pattern with its origin on a solid junction."""
-    mode_standard_error: tuple[float | None, ...] = ()
-    mode_model_error: tuple[float | None, ...] = ()
-    """Standard errors of ``mode``, by noise and by model error; empty where the mode is not
-    observable."""
-    mode_deviation_percent: tuple[float, ...] = ()
-    mode_best_fit: tuple[float, ...] = ()
     modes: tuple[ModeSummary, ...] = ()
-    """Of staggered rows, which have them instead of a single mode."""
+    mode_deviation_percent: tuple[float, ...] = ()
+    """Of a single mode, Eq. (mode), from the ideal one; staggered rows have several modes."""
     mode_observable: bool
     worst_determined: tuple[str, ...]
     undetermined: tuple[str, ...]
@@ -125,14 +128,12 @@ class SnapshotSummary:
     whole_field: WholeFieldSummary | None = None
 
     def plain(self) -> dict[str, Any]:
-        """As plain values, without what was not measured: parameters of modes, gain, offset."""
-        brightness = ("gain_min", "gain_max", "offset_min", "offset_max")
-        single = ("mode", "mode_ideal", "mode_standard_error", "mode_model_error",
-                  "mode_deviation_percent", "mode_best_fit")  # fmt: skip
-        absent = {name for name in brightness if getattr(self, name) is None}
-        absent |= (set() if self.mode else {*single}) | (set() if self.modes else {"modes"})
-        absent |= set() if self.whole_field else {"whole_field"}
-        return {name: value for name, value in to_plain(self).items() if name not in absent}
+        """As plain values, a single mode's parameters among them; without what is empty."""
+        values: dict[str, Any] = to_plain(self)
+        if self.mode_deviation_percent:
+            (mode,) = values.pop("modes")
+            values |= {key: mode[name] for key, name in _SINGLE.items()}
+        return {k: v for k, v in values.items() if k not in _OPTIONAL or v not in (None, [])}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,15 +276,16 @@ def snapshot_summary(
     """The numbers of the k-th snapshot."""
     comparison, (_, pattern) = comparisons[k], spectra[k]
     result, state = comparison.result, measured.solution.at(comparison.strain)
-    size, px = pattern_size(comparison, measured.specimen), comparison.statistics()
+    anywhere, inner, corners = pattern_size(comparison, measured.specimen)
+    px = comparison.statistics()
     found = identifiability(result, comparison.mask)
     noise = _snapshot_noise(measured, comparison.strain)
     test = result.residual_test(noise)
     rms = {name: statistics.rms_per_component for name, statistics in px.items()}
     return SnapshotSummary(
         nominal_strain=comparison.strain, branch=state.branch,
-        negative_pivots=state.negative_pivots, pattern_amplitude_px=size.anywhere,
-        pattern_inner_px=size.inner, pattern_corners_px=size.corners,
+        negative_pivots=state.negative_pivots, pattern_amplitude_px=anywhere,
+        pattern_inner_px=inner, pattern_corners_px=corners,
         rms_w_px=rms["w"], rms_best_fit_px=rms["best_fit"],
         rms_idic_to_best_fit_px=rms["idic_to_best_fit"], rms_residual=result.residual_rms,
         **_mode_numbers(comparison, measured, found), **_brightness(comparison),
@@ -358,16 +360,9 @@ def _mode_numbers(
         ))  # fmt: skip
     if is_staggered:
         return {"modes": tuple(modes)}
-    (only,) = modes
-    deviation = mode_pattern.mode_deviation(result.mode_parameters(), pitch, only.ideal)
-    return {
-        "mode": only.found,
-        "mode_ideal": only.ideal,
-        "mode_standard_error": only.standard_error,
-        "mode_model_error": only.model_error,
-        "mode_deviation_percent": tuple(deviation),
-        "mode_best_fit": only.best_fit,
-    }
+    found_mode, pattern = result.mode_parameters(), modes[0].ideal
+    deviation = mode_pattern.mode_deviation(found_mode, pitch, pattern)
+    return {"modes": tuple(modes), "mode_deviation_percent": tuple(deviation)}
 
 
 def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> tuple[float | None, ...]:

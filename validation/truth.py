@@ -70,15 +70,6 @@ class VectorStatistics:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class ErrorParts:
-    """Rms per component of truth - IDIC, truth - best fit and IDIC - best fit [px]."""
-
-    w_px: float
-    model_error_px: float
-    measurement_error_px: float
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Truth, measurement and best possible fit of one snapshot, in the reference frame."""
@@ -117,9 +108,10 @@ class Comparison:
         px = self.grid.pixel_size
         return {name: VectorStatistics.of(part, self.mask, px) for name, part in parts.items()}
 
-    def error_parts(self) -> ErrorParts:
-        """Rms of the error and of its two parts."""
-        return ErrorParts(*(part.rms_per_component for part in self.statistics().values()))
+    def error_parts(self) -> dict[str, float]:
+        """Rms per component of truth - IDIC, truth - best fit and IDIC - best fit [px]."""
+        w, model, measurement = (part.rms_per_component for part in self.statistics().values())
+        return {"w_px": w, "model_error_px": model, "measurement_error_px": measurement}
 
     def cellular(self, specimen: Specimen) -> BoolArray:
         """(rows, cols) True on material of the part with holes."""
@@ -155,35 +147,25 @@ def compare(
     return Comparison(strain, grid, mask, displacement, result, best, left.astype(np.float64))
 
 
-@dataclass(frozen=True)
-class PatternSize:
-    """Largest length of the pattern, v1 phi1 or the sum of several modes, over material [px]."""
-
-    anywhere: float
-    """In the cellular part."""
-    inner: float
-    """Without its outermost ring of cells."""
-    corners: float
-    """In its corner cells."""
-
-
 def pattern_field(result: Result, grid: PixelGrid | None = None) -> FloatArray:
     """(rows, cols, 2) the pattern: sum of v_i phi_i over all modes [mm]."""
     parts = [result.fluctuation(i, grid) for i in range(len(result.ansatz.modes))]
     return np.asarray(np.sum(parts, axis=0)) if len(parts) > 1 else parts[0]
 
 
-def pattern_size(comparison: Comparison, specimen: Specimen) -> PatternSize:
-    """Measure the identified pattern by regions of the specimen."""
+def pattern_size(comparison: Comparison, specimen: Specimen) -> tuple[float, float, float]:
+    """Largest length of the pattern, v1 phi1 or the sum of several modes, over material [px].
+
+    In the cellular part, in it without its outermost ring of cells, and in its corner cells.
+    """
     grid, (a, b) = comparison.grid, specimen.cellular_half_size
     x, y = np.abs(grid.x)[None, :], np.abs(grid.y)[:, None]
     length = lengths(pattern_field(comparison.result)) / grid.pixel_size
     outermost = 0.5 * specimen.row_distance + specimen.cell_heights[1]
     outer_x, outer_y = x > a - specimen.pitch, y > b - outermost
-
-    def largest(where: BoolArray) -> float:
-        return float(np.max(length, initial=0.0, where=where))
-
     cellular = comparison.cellular(specimen)
-    parts = cellular, cellular & ~outer_x & ~outer_y, cellular & outer_x & outer_y
-    return PatternSize(*map(largest, parts))
+    anywhere, inner, corners = (
+        float(np.max(length, initial=0.0, where=part))
+        for part in (cellular, cellular & ~outer_x & ~outer_y, cellular & outer_x & outer_y)
+    )
+    return anywhere, inner, corners

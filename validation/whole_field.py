@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import fit_displacement
@@ -14,9 +13,9 @@ from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, mode_equivalent
 from modeharvest.util.arrays import BoolArray, FloatArray
-from modeharvest.util.typed import quantity
+from modeharvest.util.typed import picked, quantity
 from modeharvest.validation.scoring.score import BULK, EDGES, JUNCTIONS, LIGAMENTS, REGIONS, regions
-from modeharvest.validation.truth import lengths
+from modeharvest.validation.truth import lengths, rms
 
 _NORMAL_95 = 1.959964
 
@@ -113,22 +112,17 @@ def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> Who
     by_idic, by_refit = (fit.displacement()[there] for fit in (correlated, whole.refit))
     w = u[there] - by_idic
     return WholeFieldNumbers(
-        w_rms_px=_rms(w) / px,
+        w_rms_px=rms(w) / px,
         w_max_px=float(lengths(w).max()) / px,
-        rms_beyond_refit_px=_rms(u[there] - by_refit) / px,
-        rms_refit_to_idic_px=_rms(by_refit - by_idic) / px,
-        sd_px=_rms(measured.standard_deviation) / px,
+        rms_beyond_refit_px=rms(u[there] - by_refit) / px,
+        rms_refit_to_idic_px=rms(by_refit - by_idic) / px,
+        sd_px=rms(measured.standard_deviation) / px,
         coverage=float(there.sum() / mask.sum()),
-        cutoff_px=measured.cutoff_px,
-        unknowns=measured.unknowns,
-        residual_rms=measured.residual_rms,
         modes=tuple(
             _both_ways(whole.refit, correlated, i) for i in range(len(whole.refit.ansatz.modes))
         ),
-        library=measured.library,
-        start=whole.start,
-        warnings=measured.warnings,
-        seconds=whole.seconds,
+        **picked(measured, "cutoff_px unknowns residual_rms library warnings"),
+        **picked(whole, "start seconds"),
     )
 
 
@@ -181,24 +175,20 @@ def compare_whole(
     inside = np.abs(error) < _NORMAL_95 * measured.standard_deviation_on(grid)
     labels = np.where(there, regions(mask, grid, specimen), -1)
     places = {name: labels == REGIONS.index(name) for name in REGIONS}
-    rms = {name: _rms(error[place]) / px for name, place in places.items() if place.any()}
+    by_region = {name: rms(error[place]) / px for name, place in places.items() if place.any()}
     return WholeFieldSummary(
-        rms_px=_rms(error[there]) / px,
-        rms_edges_px=rms.get(EDGES),
-        rms_ligaments_px=rms.get(LIGAMENTS),
-        rms_junctions_px=rms.get(JUNCTIONS),
-        rms_bulk_px=rms.get(BULK),
+        rms_px=rms(error[there]) / px,
+        rms_edges_px=by_region.get(EDGES),
+        rms_ligaments_px=by_region.get(LIGAMENTS),
+        rms_junctions_px=by_region.get(JUNCTIONS),
+        rms_bulk_px=by_region.get(BULK),
         max_px=float(lengths(error[there]).max()) / px,
         coverage=float(there.sum() / mask.sum()),
-        rms_refit_to_best_fit_px=_rms(apart),
-        cutoff_px=measured.cutoff_px,
-        unknowns=measured.unknowns,
+        rms_refit_to_best_fit_px=rms(apart),
         interval_coverage=float(inside[there].mean()),
-        interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in rms else None,
+        interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in by_region else None,
         mode=_square_mode(refit, specimen.pitch),
-        contradicted=measured.contradicted,
-        library=measured.library,
-        warnings=measured.warnings,
+        **picked(measured, "cutoff_px unknowns contradicted library warnings"),
         seconds=whole.seconds,
     )
 
@@ -209,7 +199,3 @@ def _square_mode(refit: Result, pitch: float) -> tuple[float, ...]:
     if [family.size for family in families] != [len(REFERENCE_MODE)]:
         return ()
     return tuple(mode_equivalent(refit.mode_parameters(), pitch, families[0].start)[0])
-
-
-def _rms(values: NDArray[Any]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

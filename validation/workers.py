@@ -16,7 +16,7 @@ import signal
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -32,9 +32,10 @@ from modeharvest.util.stages import digest, source_digest, stage_key
 Case = Mapping[str, Any]
 """Plain values, the seed among them."""
 Cases = tuple[Case, ...]
-CaseFunction = Callable[[Case, Path], Any]
-"""Takes a case and the campaign's folder, returns a dataclass or a mapping of plain values: the
-row of the table."""
+Row = dict[str, Any]
+"""What is found in a case, plain values by the columns of the table."""
+CaseFunction = Callable[[Case, Path], Row]
+"""Takes a case and the campaign's folder."""
 
 
 def named(function: str) -> CaseFunction:
@@ -81,8 +82,7 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
     numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
     result, error = None, ""
     try:
-        found = named(function)(case, Path(folder))
-        result = asdict(found) if is_dataclass(found) else dict(found)  # type: ignore[arg-type]
+        result = named(function)(case, Path(folder))
     except Exception:  # a case may fail in any way: that is its result
         error = traceback.format_exc()
     store(path, case, result, error)

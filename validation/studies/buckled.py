@@ -60,9 +60,10 @@ class ResolutionSpec:
         return leave(to_plain(self), folder, "subjects/{}.json")
 
     @classmethod
+    @lru_cache(maxsize=1)
     def read(cls, folder: Path, name: str) -> ResolutionSpec:
         """What :meth:`write` left; one worker keeps it, and its images, between cases."""
-        return _resolution_spec(folder, name)
+        return made(ResolutionSpec, read_json(folder / "subjects" / f"{name}.json"))
 
     @property
     def points(self) -> FloatArray:
@@ -91,11 +92,6 @@ class ResolutionSpec:
         guess = np.zeros(ansatz.size) if is_still else self.buckled.start(degree, degree)
         options = CorrelationOptions((Level(1, 0.0),), how.edge_px, how.order)
         return correlate(pair, ansatz, guess=guess, options=options)
-
-
-@lru_cache(maxsize=1)
-def _resolution_spec(folder: Path, name: str) -> ResolutionSpec:
-    return made(ResolutionSpec, read_json(folder / "subjects" / f"{name}.json"))
 
 
 @dataclass(frozen=True)

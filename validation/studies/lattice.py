@@ -108,10 +108,6 @@ PATTERN = (math.pi, math.pi)
 """The wave of the paper's pattern, as phases from cell to cell [rad]."""
 EQ_MODE = square_family("hole")
 """The analytic mode, Eq. (mode) of the paper; a hole's centre is the origin."""
-RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
-"""Of d/l [-]: 0.7895 is the paper's; 0.8696 and 0.95 have independent values, too."""
-SHOWN = (0.95, 0.7895, 0.25)
-"""Of d/l in the paper's Fig. "graded", from left to right."""
 _STEP, _CLOSE = 0.02, 0.002  # of the load [-]
 _NARROW = 0.005  # bracket of d/l where another mode comes first [-]
 LOADINGS: dict[str, MacroLoading] = {
@@ -379,16 +375,16 @@ class StudyPlan:
     unit cell sizes and materials at the lattice's own d/l and loading.
     """
 
-    ratios: tuple[float, ...] = RATIOS
-    """d/l [-]."""
+    ratios: tuple[float, ...] = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
+    """d/l [-]: 0.7895 is the paper's; 0.8696 and 0.95 have independent values, too."""
     loadings: tuple[str, ...] = _LOADINGS
     """Among "uniaxial", "uniaxial-strain" and "equibiaxial"."""
     pitches: tuple[float, ...] = ()
     """Other l [mm]; the mesh is scaled, too."""
     materials: tuple[str, ...] = ()
     """Names among ``STUDIED_MATERIALS``."""
-    overlays: tuple[float, ...] = SHOWN
-    """d/l of the pictures of numerical over analytic mode [-]."""
+    overlays: tuple[float, ...] = (0.95, 0.7895, 0.25)
+    """d/l of the pictures of numerical over analytic mode [-]; as in the paper's Fig. "graded"."""
     divisions: int = 13
     """Elements along l."""
     largest: float = 0.28

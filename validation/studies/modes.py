@@ -9,10 +9,10 @@ One case in ``specimens/NAME/`` of the study's folder, NAME the digest of the de
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -25,11 +25,17 @@ from modeharvest.idic.spectra.pattern import mode_equivalent
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.studies.lattice import STUDIED_MATERIALS
-from modeharvest.validation.studies.modes_specimen import LatticeMode, SpecimenSpec, buckle
+from modeharvest.validation.studies.lattice import STUDIED_MATERIALS, PatternMode
+from modeharvest.validation.studies.modes_specimen import (
+    SpecimenSpec,
+    buckle,
+    lattice_mode,
+    nearest_aspect,
+    overlap_on_specimen,
+)
 from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
 from modeharvest.validation.truth import Comparison
-from modeharvest.validation.workers import Case, Cases
+from modeharvest.validation.workers import Case, Cases, Row
 
 PARAMETERS = tuple(f"a{k}" for k in range(1, 8))
 WAVE_VECTORS = list(PARAMETERS[1:5])
@@ -88,8 +94,8 @@ def standardised_errors(measured: pd.DataFrame) -> NDArray[np.float64]:
     return np.asarray((deviations(measured) - deviations(measured, "best_")).to_numpy() / sd)
 
 
-def one_specimen(case: Case, folder: Path) -> dict[str, Any]:
-    """Buckle, image, measure and compare: a :class:`SpecimenRow`, and :func:`_measured_row`."""
+def one_specimen(case: Case, folder: Path) -> Row:
+    """Buckle, image, measure and compare: :func:`_specimen_row` and :func:`_measured_row`."""
     own = folder / "specimens" / case["specimen"]
     described = SpecimenSpec.read(own / "specimen.json")
     experiment, path = described.experiment, described.solution_path(folder)
@@ -98,8 +104,8 @@ def one_specimen(case: Case, folder: Path) -> dict[str, Any]:
             raise InputError(f"expected the base's solution at {path}, found none; run it again")
         buckle(experiment, described.amplitude, described.largest).write(path)
     solution = Solution.read(path)
-    lattice = LatticeMode.of(experiment.specimen, experiment.material, described.divisions)
-    row = asdict(SpecimenRow.of(described, solution, lattice))
+    lattice = lattice_mode(experiment.specimen, experiment.material, described.divisions)
+    row = _specimen_row(described, solution, lattice)
     if row["first"] == "none":
         return row
     spec = ImagePairSpec(experiment, described.imaging, described.correlation, lambda: solution)
@@ -110,53 +116,40 @@ def one_specimen(case: Case, folder: Path) -> dict[str, Any]:
         pair.discard()
 
 
-@dataclass(frozen=True)
-class SpecimenRow:
-    """What a specimen is, and how it and the infinite lattice of its cells buckle."""
+def _specimen_row(described: SpecimenSpec, solution: Solution, lattice: PatternMode) -> Row:
+    """What a specimen is, and how it and the infinite lattice of its cells buckle.
 
-    ratio: float
-    """d/l in the middle [-]."""
-    smallest_ratio: float
-    largest_ratio: float
-    """Of its holes [-]."""
-    pitch_mm: float
-    first: str
-    """What it buckles into, "pattern", "other" or "none"."""
-    pattern_share: float
-    """The pattern's share of that mode [-]."""
-    critical_strain: float
-    strain: float
-    """Where it buckles and where it is measured [-]."""
-    unstable_pivots: int | None
-    """Negative pivots where it is measured."""
-    simulation: str
-    lattice_first: str
-    lattice_pattern_strain: float
-    lattice_overlap_ideal: float
-    """``kind``, ``pattern`` and ``overlap`` of the lattice's
-    :class:`~modeharvest.validation.studies.lattice.ModeRow`."""
-    lattice_a1: float
-    """a₁ of the lattice."""
-
-    @classmethod
-    def of(cls, described: SpecimenSpec, solution: Solution, lattice: LatticeMode) -> SpecimenRow:
-        """Of a simulated specimen."""
-        specimen, critical = described.specimen, solution.info.get("critical")
-        first, share, buckles_at = "none", np.nan, np.nan
-        if critical:
-            share, buckles_at = critical["pattern_overlap_by_cell"], critical["strain"]
-            first = "pattern" if share >= PATTERN_SHARE else "other"
-        strain = max(s.nominal_strain for s in solution.snapshots)
-        pitch, diameters, row = specimen.pitch, specimen.diameters, lattice.mode.row
-        return cls(
-            specimen.diameter / pitch, float(diameters.min() / pitch),
-            float(diameters.max() / pitch), pitch, first, share, buckles_at, strain,
-            solution.at(strain).negative_pivots, solution.info.get("outcome", ""),
-            row.kind, row.pattern, row.overlap, lattice.aspect,
-        )  # fmt: skip
+    ``ratio``: d/l in the middle; ``first``: what it buckles into, "pattern", "other" or "none";
+    ``pattern_share``: the pattern's share of that mode; ``strain``: where it is measured, with
+    ``unstable_pivots`` negative ones; ``lattice_...``: ``kind``, ``pattern`` and ``overlap`` of the
+    lattice's :class:`~modeharvest.validation.studies.lattice.ModeRow`, and its a₁.
+    """
+    specimen, critical = described.specimen, solution.info.get("critical")
+    first, share, buckles_at = "none", np.nan, np.nan
+    if critical:
+        share, buckles_at = critical["pattern_overlap_by_cell"], critical["strain"]
+        first = "pattern" if share >= PATTERN_SHARE else "other"
+    strain = max(s.nominal_strain for s in solution.snapshots)
+    ratios = specimen.diameters / specimen.pitch
+    return {
+        "ratio": specimen.diameter / specimen.pitch,
+        "smallest_ratio": float(ratios.min()),
+        "largest_ratio": float(ratios.max()),
+        "pitch_mm": specimen.pitch,
+        "first": first,
+        "pattern_share": share,
+        "critical_strain": buckles_at,
+        "strain": strain,
+        "unstable_pivots": solution.at(strain).negative_pivots,
+        "simulation": solution.info.get("outcome", ""),
+        "lattice_first": lattice.row.kind,
+        "lattice_pattern_strain": lattice.row.pattern,
+        "lattice_overlap_ideal": lattice.row.overlap,
+        "lattice_a1": nearest_aspect(lattice),
+    }
 
 
-def _measured_row(pair: VirtualImagePair, lattice: LatticeMode, own: Path) -> dict[str, Any]:
+def _measured_row(pair: VirtualImagePair, lattice: PatternMode, own: Path) -> Row:
     """Correlate from the standard initial guess; compare with truth, best fit and lattice.
 
     ``a1`` ... ``a7`` of the measurement and ``best_a1`` ... of the best fit, in the form nearest to
@@ -171,18 +164,18 @@ def _measured_row(pair: VirtualImagePair, lattice: LatticeMode, own: Path) -> di
     result.write(own / "result.json")
     found.best.write(own / "best.json")
     units = np.array([1.0] * 5 + [specimen.pitch] * 2)
-    row: dict[str, Any] = {"outcome": result.outcome.value, "iterations": len(result.history)}
+    row: Row = {"outcome": result.outcome.value, "iterations": len(result.history)}
     for prefix, fit in (("", result), ("best_", found.best)):
         family, a = fit.ansatz.modes[0].family, fit.mode_parameters()
         nearest, _ = mode_equivalent(a, specimen.pitch, family.start)
         row |= _columns(nearest / units, prefix + "{}")
-        row[prefix + "overlap_lattice"] = lattice.overlap(specimen, family, a)
+        row[prefix + "overlap_lattice"] = overlap_on_specimen(lattice, specimen, family, a)
     covariances = {"model_error": pair.matched(result).sandwich_covariance(specimen.pitch),
                    "noise": result.covariance(NOISE)}  # fmt: skip
     for cause, covariance in covariances.items():
         sd = np.sqrt(np.diag(covariance)[result.ansatz.phi_slice(0)]) / units
         row |= _columns(sd, "{}_sd_" + cause)
-    return row | asdict(found.error_parts()) | _patterns(found, specimen)
+    return row | found.error_parts() | _patterns(found, specimen)
 
 
 def _columns(values: Iterable[float], name: str) -> dict[str, float]:
@@ -220,15 +213,6 @@ class ModesAnalysis:
     """Of these the base and those that differ from it in d/l only."""
     folder: Path
     """The study's, where the specimens are."""
-
-    @classmethod
-    def of(cls, table: pd.DataFrame, folder: Path) -> ModesAnalysis:
-        """From the table of all specimens."""
-        ran = table[table["error"] == ""]
-        is_converged = ran["outcome"] == "converged" if "outcome" in ran else False
-        measured = ran[(ran["first"] == "pattern") & is_converged]
-        sizes = measured[measured["varied"].isin([BASE, "d/l"])].sort_values("ratio")
-        return cls(ran, measured, sizes, folder)
 
 
 @dataclass(frozen=True)
@@ -300,25 +284,25 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
         base = SpecimenSpec.of(spec, self.strain, self.largest, self.divisions)
         own = replace(spec.solution, snapshots=(spec.solution.at(self.strain),))
         own.write(base.solution_path(folder))
+        pitch = base.specimen.pitch
+        along, across = "graded along the load", "graded across the load"
+        specimens = [
+            (BASE, "", base),
+            *(("d/l", f"{r:g}", base.changed(diameter=r * pitch)) for r in self.ratios),
+            *(("l", f"{p:g} mm", base.scaled(p)) for p in self.pitches),
+            *(("material", m, base.changed(STUDIED_MATERIALS[m])) for m in self.materials),
+            *((along, f"{g:g}", base.changed(grading_x=g)) for g in self.gradings_x),
+            *((across, f"{g:g}", base.changed(grading_y=g)) for g in self.gradings_y),
+        ]
         return tuple(
             {"varied": varied, "level": level, "specimen": described.leave(folder)}
-            for varied, level, described in ((BASE, "", base), *self._others(base))
+            for varied, level, described in specimens
         )
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> ModesAnalysis:
         """The specimens whose pattern was measured."""
-        return ModesAnalysis.of(table, folder)
-
-    def _others(self, base: SpecimenSpec) -> Iterator[tuple[str, str, SpecimenSpec]]:
-        """What is varied, its level as text, and the specimen."""
-        pitch = base.specimen.pitch
-        for ratio in self.ratios:
-            yield "d/l", f"{ratio:g}", base.changed(diameter=ratio * pitch)
-        for other in self.pitches:
-            yield "l", f"{other:g} mm", base.scaled(other)
-        for material in self.materials:
-            yield "material", material, base.changed(STUDIED_MATERIALS[material])
-        for along in self.gradings_x:
-            yield "graded along the load", f"{along:g}", base.changed(grading_x=along)
-        for across in self.gradings_y:
-            yield "graded across the load", f"{across:g}", base.changed(grading_y=across)
+        ran = table[table["error"] == ""]
+        is_converged = ran["outcome"] == "converged" if "outcome" in ran else False
+        measured = ran[(ran["first"] == "pattern") & is_converged]
+        sizes = measured[measured["varied"].isin([BASE, "d/l"])].sort_values("ratio")
+        return ModesAnalysis(ran, measured, sizes, folder)

@@ -203,53 +203,47 @@ class SpecimenSpec:
         return leave(self.plain(), folder, "specimens/{}/specimen.json")
 
 
-@dataclass(frozen=True, eq=False)
-class LatticeMode:
-    """The numerical (π, π) mode of an infinite lattice, and what a mode family makes of it."""
+def lattice_mode(specimen: Specimen, material: Material, divisions: int) -> PatternMode:
+    """The mode of the infinite lattice of a specimen's cells, in uniaxial compression.
 
-    mode: PatternMode
-    """On one cell about a hole, beside Eq. (mode) with its ideal parameters."""
+    In its first critical state, or where it stays stable in the last one looked at. Of a graded
+    specimen: the lattice of the cell at its centre. ``divisions``: elements along l.
+    MissingDependencyError without dolfinx.
+    """
+    ratio, pitch = specimen.diameter / specimen.pitch, specimen.pitch
+    lattice = StudiedLattice(ratio, material=material, pitch=pitch, divisions=divisions)
+    with requiring_dolfinx("the mode of an infinite lattice needs"):
+        return pattern_mode(lattice)
 
-    @classmethod
-    def of(cls, specimen: Specimen, material: Material, divisions: int) -> LatticeMode:
-        """Of the lattice of a specimen's cells, in uniaxial compression.
 
-        In its first critical state, or where it stays stable in the last one looked at. Of a graded
-        specimen: the lattice of the cell at its centre. ``divisions``: elements along l.
-        MissingDependencyError without dolfinx.
-        """
-        ratio, pitch = specimen.diameter / specimen.pitch, specimen.pitch
-        lattice = StudiedLattice(ratio, material=material, pitch=pitch, divisions=divisions)
-        with requiring_dolfinx("the mode of an infinite lattice needs"):
-            return cls(pattern_mode(lattice))
+def nearest_aspect(mode: PatternMode) -> float:
+    """a₁ of Eq. (mode) that is nearest to a lattice's mode [-].
 
-    @property
-    def aspect(self) -> float:
-        """a₁ of Eq. (mode) that is nearest to the mode [-].
+    By symmetry and period the mode's wave vectors and phases are the ideal ones exactly; of the
+    seven parameters a₁ is left, the ratio of the two components' amplitudes.
+    """
+    rule = MeshQuadrature(mode.mesh)
+    shape, ideal = rule.values(mode.shape), rule.values(mode.analytic)
+    along, across = (
+        rule.weights @ (shape[:, c] * ideal[:, c]) / (rule.weights @ ideal[:, c] ** 2)
+        for c in (0, 1)
+    )
+    return float(along / across)
 
-        By symmetry and period the mode's wave vectors and phases are the ideal ones exactly; of the
-        seven parameters a₁ is left, the ratio of the two components' amplitudes.
-        """
-        rule = MeshQuadrature(self.mode.mesh)
-        mode, ideal = rule.values(self.mode.shape), rule.values(self.mode.analytic)
-        along, across = (
-            rule.weights @ (mode[:, c] * ideal[:, c]) / (rule.weights @ ideal[:, c] ** 2)
-            for c in (0, 1)
-        )
-        return float(along / across)
 
-    def overlap(self, specimen: Specimen, family: ModeFamily, parameters: ArrayLike) -> float:
-        """Normalised overlap with a family's mode over all unit cells of a specimen [-].
+def overlap_on_specimen(
+    mode: PatternMode, specimen: Specimen, family: ModeFamily, parameters: ArrayLike
+) -> float:
+    """Normalised overlap of a lattice's mode with a family's over all cells of a specimen [-].
 
-        |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude; u is the mode on copies
-        of its cell about all holes, neighbours of opposite signs.
-        """
-        mesh, shape = self.mode.mesh, self.mode.shape
-        centres = specimen.hole_centres
-        steps = np.rint((centres - centres[0]) / specimen.pitch).astype(int).sum(axis=1)
-        nodes = (centres[:, None, :] + mesh.nodes).reshape(-1, 2)
-        first = len(mesh.nodes) * np.arange(len(centres))
-        cells = (first[:, None, None] + mesh.cells).reshape(-1, mesh.cells.shape[1])
-        field = (((-1.0) ** steps)[:, None, None] * shape).reshape(-1, 2)
-        copies = Mesh(nodes, cells, mesh.element)
-        return overlap(copies, field, family, specimen.pitch, parameters)
+    |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude; u is the mode on copies of its
+    cell about all holes, neighbours of opposite signs.
+    """
+    mesh, centres = mode.mesh, specimen.hole_centres
+    steps = np.rint((centres - centres[0]) / specimen.pitch).astype(int).sum(axis=1)
+    nodes = (centres[:, None, :] + mesh.nodes).reshape(-1, 2)
+    first = len(mesh.nodes) * np.arange(len(centres))
+    cells = (first[:, None, None] + mesh.cells).reshape(-1, mesh.cells.shape[1])
+    field = (((-1.0) ** steps)[:, None, None] * mode.shape).reshape(-1, 2)
+    copies = Mesh(nodes, cells, mesh.element)
+    return overlap(copies, field, family, specimen.pitch, parameters)

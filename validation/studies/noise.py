@@ -21,7 +21,7 @@ gradient of g's own noise is no longer small against the speckle's.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -43,8 +43,15 @@ from modeharvest.validation.studies.noise_statistics import (
     FieldPoints,
     NoiseAnalysis,
 )
-from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair, noisy
-from modeharvest.validation.workers import Case, Cases
+from modeharvest.validation.studies.study import (
+    ImagePairSpec,
+    Study,
+    VirtualImagePair,
+    noisy,
+    outcome_of,
+)
+from modeharvest.validation.truth import rms
+from modeharvest.validation.workers import Case, Cases, Row
 
 EXAMPLES = 24
 """Of the noise, for V; each counts as many times as there are unit cells."""
@@ -105,29 +112,6 @@ def _noise_of_g(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, Float
 
 
 @dataclass(frozen=True)
-class Realisation:
-    """What a correlation finds under one realisation of the noise, or without it."""
-
-    outcome: str
-    iterations: int
-    residual: float
-    unknowns: list[float]
-    predicted: list[float] | list[list[float]]
-    """Standard deviations of the unknowns by the result's own covariance given the noise, followed
-    by those of the fields at :class:`FieldPoints`; without noise a list of them for each of
-    ``COVARIANCES``, for noise of 1."""
-    curvature_sd_mm: float | None = None
-    """Rms over the points of u's standard deviation by the covariance H⁻¹, without noise and in the
-    first realisation of each level [mm]."""
-    w_px: float | None = None
-    model_error_px: float | None = None
-    measurement_error_px: float | None = None
-    v1_percent: float | None = None
-    """Errors without noise: :class:`~modeharvest.validation.truth.ErrorParts` and
-    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`."""
-
-
-@dataclass(frozen=True)
 class NoiseStudy(Study[NoiseAnalysis]):
     """Correlate a pair of images under white noise in both, many times.
 
@@ -183,33 +167,32 @@ class NoiseStudy(Study[NoiseAnalysis]):
         return NoiseAnalysis.of(table, VirtualImagePair.open(folder, table["images"].iloc[0]))
 
 
-def one_realisation(case: Case, folder: Path) -> Realisation:
-    """Correlate under one realisation of the noise, from the standard initial guess."""
+def one_realisation(case: Case, folder: Path) -> Row:
+    """Correlate under one realisation of the noise, from the standard initial guess.
+
+    ``predicted``: standard deviations of the unknowns by the result's own covariance given the
+    noise, followed by those of the fields at :class:`FieldPoints`; without noise a list of them for
+    each of ``COVARIANCES``, for noise of 1, and errors as in
+    :meth:`~modeharvest.validation.studies.study.VirtualImagePair.errors`. ``curvature_sd_mm``: rms
+    over the points of u's standard deviation by the covariance H⁻¹, without noise and in the first
+    realisation of each level [mm].
+    """
     virtual, level = VirtualImagePair.open(folder, case["images"]), float(case["level"])
     points, pair = FieldPoints.of(virtual), virtual.pair
     if level:
         rng = np.random.default_rng([case["seed"], case["pair"], round(1e9 * level)])
         pair = noisy(pair, level, rng, case["sign"])
     result = virtual.correlate(pair=pair)
-    curvature_sd = None
+    row = {**outcome_of(result), "unknowns": result.unknowns.tolist()}
+    if level:
+        row["predicted"] = _predicted(points, result, result.covariance(level))
+    else:
+        by_cause = covariances_by_cause(virtual, result, case["seed"])
+        row["predicted"] = [_predicted(points, result, by_cause[name]) for name in COVARIANCES]
     if not level or (case["pair"] == 0 and case["sign"] == 1):
         hessian = virtual.matched(result, pair).inverse_hessian
-        sd = points.predicted(result, hessian)[:, PARTS["u"]]
-        curvature_sd = float(np.sqrt((sd**2).mean()))
-    unknowns = list(map(float, result.unknowns))
-    found = Realisation(
-        result.outcome.value, result.iterations, result.residual_rms, unknowns, [], curvature_sd
-    )
-    if level:
-        return replace(found, predicted=_predicted(points, result, result.covariance(level)))
-    by_cause = covariances_by_cause(virtual, result, case["seed"])
-    comparison = virtual.compare(result)
-    return replace(
-        found,
-        predicted=[_predicted(points, result, by_cause[name]) for name in COVARIANCES],
-        **asdict(comparison.error_parts()),
-        v1_percent=comparison.v1_percent(virtual.specimen),
-    )
+        row["curvature_sd_mm"] = rms(points.predicted(result, hessian)[:, PARTS["u"]])
+    return row if level else row | virtual.errors(result)
 
 
 def _predicted(points: FieldPoints, result: Result, covariance: FloatArray) -> list[float]:

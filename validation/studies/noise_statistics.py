@@ -35,6 +35,9 @@ class FieldPoints:
     """Axes of the coarse grid, in pixels of the images."""
     inside: BoolArray
     """(rows, cols) True on material; the points are those, row by row."""
+    x: FloatArray
+    y: FloatArray
+    """(points,) [mm]."""
 
     @classmethod
     def of(cls, pair: VirtualImagePair) -> FieldPoints:
@@ -42,17 +45,9 @@ class FieldPoints:
         grid = pair.images.grid
         step = max(1, round(pair.specimen.pitch / PER_CELL / grid.pixel_size))
         rows, cols = (np.arange((n % step) // 2, n, step) for n in grid.shape)
-        return cls(pair, rows, cols, pair.mask[np.ix_(rows, cols)])
-
-    @property
-    def x(self) -> FloatArray:
-        """(points,) [mm]."""
-        return np.asarray(self.pair.images.grid.x[self.cols[np.nonzero(self.inside)[1]]])
-
-    @property
-    def y(self) -> FloatArray:
-        """(points,) [mm]."""
-        return np.asarray(self.pair.images.grid.y[self.rows[np.nonzero(self.inside)[0]]])
+        inside = pair.mask[np.ix_(rows, cols)]
+        row, col = np.nonzero(inside)
+        return cls(pair, rows, cols, inside, grid.x[cols[col]], grid.y[rows[row]])
 
     @property
     def cellular(self) -> BoolArray:
@@ -206,70 +201,38 @@ def _predictions(flat: FloatArray, n: int) -> dict[str, FloatArray]:
     return by_field(flat[..., :n], fields.reshape(*fields.shape[:-1], -1, 7))
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseFreeCase:
-    """The solution without noise."""
-
-    row: pd.Series
-
-    @classmethod
-    def of(cls, table: pd.DataFrame) -> NoiseFreeCase:
-        """The case without noise; InputError if it failed."""
-        found = table[(table["error"] == "") & (table["level"] == 0.0)]
-        if not len(found):
-            raise InputError("study: expected the case without noise to succeed, got none that did")
-        return cls(found.iloc[0])
-
-    @property
-    def unknowns(self) -> FloatArray:
-        """(n,) what all errors are measured from."""
-        return np.array(self.row["unknowns"])
-
-    def predicted(self, cause: str) -> dict[str, FloatArray]:
-        """Standard deviations for noise of 1 by one of ``COVARIANCES``, see :func:`by_field`."""
-        flat = np.array(self.row["predicted"][COVARIANCES.index(cause)], dtype=np.float64)
-        return _predictions(flat, len(self.row["unknowns"]))
-
-
-def read_levels(table: pd.DataFrame, noise_free: NoiseFreeCase, points: FieldPoints) -> Levels:
-    """All realisations' errors and their bound 2 s²M⁻¹; InputError without two whole pairs."""
-    noisy = table[(table["error"] == "") & (table["level"] > 0.0)]
-    found = {}
-    for level, part in noisy.groupby("level"):
-        by_pair = [pair.sort_values("sign") for _, pair in part.groupby("pair") if len(pair) == 2]
-        if len(by_pair) >= 2:
-            found[float(level)] = _read_level(float(level), by_pair, noise_free, points)
-    if not found:
-        raise InputError("study: expected two whole pairs of realisations at a level, got fewer")
-    return found
-
-
 def _read_level(
-    level: float, by_pair: list[pd.DataFrame], noise_free: NoiseFreeCase, points: FieldPoints
+    part: pd.DataFrame, true: FloatArray, bound: Mapping[str, FloatArray], points: FieldPoints
 ) -> dict[str, PairedErrors]:
+    """Errors of a level's whole pairs of realisations.
+
+    ``true``: (n,) unknowns without noise; ``bound``: standard deviations, 0 or infinite for what
+    does not count: no noise moves it, or the images do not determine it.
+    """
+    by_pair = [pair.sort_values("sign") for _, pair in part.groupby("pair") if len(pair) == 2]
+
     def column(name: str) -> FloatArray:
         return np.array([[np.array(v, dtype=np.float64) for v in pair[name]] for pair in by_pair])
 
-    true, a = noise_free.unknowns, column("unknowns")
+    a = column("unknowns")
     fields = np.array([[points.fields(one) for one in pair] for pair in a]) - points.fields(true)
-    predicted, least = _predictions(column("predicted"), len(true)), noise_free.predicted("bound")
-    least["v1"][~points.cellular] = 0.0  # where phi1 fades out it does not count
-    found = {}
+    predicted, found = _predictions(column("predicted"), len(true)), {}
     for name, off in by_field(a - true, fields).items():
-        bound = level * least[name]
-        known = np.isfinite(bound)  # the others are not determined by the images
+        known = np.isfinite(bound[name])
         found[name] = PairedErrors(
-            np.where(known, off, 0.0), predicted[name], np.where(known, bound, 0.0)
+            np.where(known, off, 0.0), predicted[name], np.where(known, bound[name], 0.0)
         )
     return found
 
 
-def against_bound(levels: Levels, noise_free: NoiseFreeCase, cause: str) -> Levels:
-    """Set the same errors against another bound, and error bars by the same cause."""
-    bounds, factors = noise_free.predicted("bound"), {}
-    for name, sd in noise_free.predicted(cause).items():
-        known = np.isfinite(bounds[name]) & (bounds[name] > 0.0)
-        factors[name] = _divided(sd, bounds[name], known, 1.0)
+def _against(
+    levels: Levels, bound: Mapping[str, FloatArray], sd: Mapping[str, FloatArray]
+) -> Levels:
+    """Set errors against other standard deviations than the bound's."""
+    factors = {
+        name: _divided(sd[name], part, np.isfinite(part) & (part > 0.0), 1.0)
+        for name, part in bound.items()
+    }
     return {
         level: {name: pairs.against(factors[name]) for name, pairs in parts.items()}
         for level, parts in levels.items()
@@ -281,26 +244,46 @@ class NoiseAnalysis:
     """What the table of a noise study says."""
 
     points: FieldPoints
-    noise_free: NoiseFreeCase
-    by_bound: Levels
-    by_least: Levels
-    by_hessian: Levels
-    """Errors against the Cramér–Rao bound, the least of least squares and the Hessian-corrected
-    covariance."""
+    noise_free: pd.Series
+    """The row of the case without noise, whose unknowns all errors are measured from."""
+    predicted: Mapping[str, Mapping[str, FloatArray]]
+    """Standard deviations for noise of 1 by each of ``COVARIANCES``, see :func:`by_field`."""
+    against: Mapping[str, Levels]
+    """The errors against each of them, and error bars by it."""
     curvature_sd_ratio: Mapping[float, float]
     """By level, u's standard deviation by noisy images' own curvature over that of exact ones."""
     not_converged: int
 
     @classmethod
     def of(cls, table: pd.DataFrame, pair: VirtualImagePair) -> NoiseAnalysis:
-        """From the table of all realisations of a pair."""
-        points, noise_free = FieldPoints.of(pair), NoiseFreeCase.of(table)
-        levels = read_levels(table, noise_free, points)
-        done = table[table["error"] == ""]
+        """From the table of all realisations of a pair.
+
+        InputError if the case without noise failed, or no level has two whole pairs.
+        """
+        points, done = FieldPoints.of(pair), table[table["error"] == ""]
+        noise_free = done[done["level"] == 0.0]
+        if not len(noise_free):
+            raise InputError("study: expected the case without noise to succeed, got none that did")
+        row = noise_free.iloc[0]
+        true = np.array(row["unknowns"])
+        predicted = {
+            cause: _predictions(np.array(flat, dtype=np.float64), len(true))
+            for cause, flat in zip(COVARIANCES, row["predicted"], strict=True)
+        }
+        least = dict(predicted["bound"])
+        least["v1"] = np.where(points.cellular[:, None], least["v1"], 0.0)  # where phi1 fades out
+        levels = {
+            float(level): _read_level(part, true, {k: level * v for k, v in least.items()}, points)
+            for level, part in done[done["level"] > 0.0].groupby("level")
+            if (part["pair"].value_counts() == 2).sum() >= 2
+        }
+        if not levels:
+            wanted = "two whole pairs of realisations at a level"
+            raise InputError(f"study: expected {wanted}, got fewer")
         sd = done[done["curvature_sd_mm"].notna()].set_index("level")["curvature_sd_mm"]
-        by_least, by_hessian = (
-            against_bound(levels, noise_free, cause) for cause in ("least", HESSIAN_CORRECTED)
-        )
         ratios = {float(level): float(sd[level] / sd[0.0]) for level in sd.index if level}
         lost = int((done["outcome"] != "converged").sum())
-        return cls(points, noise_free, levels, by_least, by_hessian, ratios, lost)
+        against = {
+            cause: _against(levels, predicted["bound"], sd) for cause, sd in predicted.items()
+        }
+        return cls(points, row, predicted, against, ratios, lost)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -36,37 +36,34 @@ from modeharvest.validation.studies.transfer import (
     wave_share,
 )
 from modeharvest.validation.truth import rms
-from modeharvest.validation.workers import Case, Cases
+from modeharvest.validation.workers import Case, Cases, Row
 
-Row = dict[str, Any]
-"""Of the table: quantities by their names, with the degree behind an underscore."""
 MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 fixed"}
 
 
 @lru_cache(maxsize=2)
-def _exact_pair(folder: Path, name: str, motion: str) -> ImagePair:
+def _exact_pair(spec: ResolutionSpec, motion: str) -> ImagePair:
     """The images without wave and noise."""
-    buckled = ResolutionSpec.read(folder, name).buckled
-    return buckled.still() if motion == "still" else buckled.images()
+    return spec.buckled.still() if motion == "still" else spec.buckled.images()
 
 
 @lru_cache(maxsize=32)
-def _noise_free(folder: Path, name: str, motion: str, degree: int) -> Result:
+def _noise_free(spec: ResolutionSpec, motion: str, degree: int) -> Result:
     """What is measured in them."""
-    pair = _exact_pair(folder, name, motion)
-    return ResolutionSpec.read(folder, name).correlate(pair, degree, motion)
+    return spec.correlate(_exact_pair(spec, motion), degree, motion)
 
 
 def one_case(case: Case, folder: Path) -> Row:
-    """Run a case of :meth:`ResolutionStudy.prepare`; its ``task`` says what: wave, noise, floor."""
+    """Run a case of :meth:`ResolutionStudy.prepare`; its ``task`` says what: wave, noise, floor.
+
+    Quantities of several degrees have the degree behind an underscore.
+    """
     tasks = {"wave": _wave, "noise": _noise, "floor": _floor}
-    return tasks[case["task"]](case, folder)
+    return tasks[case["task"]](case, ResolutionSpec.read(folder, case["images"]))
 
 
-def _wave(case: Case, folder: Path) -> Row:
+def _wave(case: Case, spec: ResolutionSpec) -> Row:
     """The shares of a wave that are found in its own part and in the whole, by degree."""
-    name = case["images"]
-    spec = ResolutionSpec.read(folder, name)
     buckled, points = spec.buckled, spec.points
     amplitude = spec.amplitude_px * buckled.pixel_size
     wave = AddedWave(case["part"], case["axis"], case["period"], case["phase"], amplitude)
@@ -75,42 +72,40 @@ def _wave(case: Case, folder: Path) -> Row:
     row: Row = {"power": float((true**2).sum())}
     for degree in spec.measured:
         found = spec.correlate(pair, degree, "buckled")
-        change = _changes(_noise_free(folder, name, "buckled", degree), found, points)
-        own, whole = change[case["part"]], change["v0"] + change["v1"]
+        v0, _, v1phi1 = _changes(_noise_free(spec, "buckled", degree), found, points)
+        own, whole = v0 if case["part"] == "v0" else v1phi1, v0 + v1phi1
         row[f"own_{degree}"] = float(wave_share(own[..., None], true)[0])
         row[f"whole_{degree}"] = float(wave_share(whole[..., None], true)[0])
         row[f"outcome_{degree}"] = found.outcome.value
     return row
 
 
-def _changes(quiet: Result, found: Result, points: FloatArray) -> dict[str, FloatArray]:
-    """(m, 2) by how much v0 and v1 phi1 ("v1") of a result differ from another's at points [mm]."""
+def _changes(quiet: Result, found: Result, points: FloatArray) -> list[FloatArray]:
+    """By how much v0 (m, 2), v1 (m,) and v1 phi1 (m, 2) of two results differ at points [mm]."""
     x, y = points[:, 0, None], points[:, 1, None]
-    parts = [
-        (fit.ansatz.v0(fit.unknowns, x, y), fit.ansatz.fluctuation(0, fit.unknowns, x, y))
-        for fit in (quiet, found)
-    ]
-    return {name: (b - a)[:, 0] for name, a, b in zip(WAVED, *parts, strict=True)}
+    before, after = (
+        (ansatz.v0(a, x, y), ansatz.v(0, a, x, y), ansatz.fluctuation(0, a, x, y))
+        for ansatz, a in ((fit.ansatz, fit.unknowns) for fit in (quiet, found))
+    )
+    return [(b - a)[:, 0] for a, b in zip(before, after, strict=True)]
 
 
-def _floor(case: Case, folder: Path) -> Row:
+def _floor(case: Case, spec: ResolutionSpec) -> Row:
     """Standard deviations by 2 s^2 M^-1 of the exact images, rms over the material [px]."""
-    spec = ResolutionSpec.read(folder, case["images"])
-    result = _noise_free(folder, case["images"], case["motion"], case["degree"])
+    result = _noise_free(spec, case["motion"], case["degree"])
     predicted = _predicted(spec, result, 2.0 * spec.noise**2 * result.inverse)
     return {"unknowns": result.ansatz.size, "outcome": result.outcome.value, **predicted}
 
 
-def _noise(case: Case, folder: Path) -> Row:
+def _noise(case: Case, spec: ResolutionSpec) -> Row:
     """Errors of fields from noisy images, and those their covariance predicts, by degree [px]."""
-    name, motion = case["images"], case["motion"]
-    spec = ResolutionSpec.read(folder, name)
+    motion = case["motion"]
     rng = np.random.default_rng([case["seed"], case["number"], motion == "still"])
-    pair = noisy(_exact_pair(folder, name, motion), spec.noise, rng)
+    pair = noisy(_exact_pair(spec, motion), spec.noise, rng)
     row: Row = {}
     for degree in spec.measured:
         found = spec.correlate(pair, degree, motion)
-        errors = _errors(spec, found, _noise_free(folder, name, motion, degree))
+        errors = _errors(spec, found, _noise_free(spec, motion, degree))
         predicted = _predicted(spec, found, found.covariance(spec.noise))
         row |= {f"{key}_{degree}": value for key, value in errors.items()}
         row |= {f"predicted_{key}_{degree}": value for key, value in predicted.items()}
@@ -127,10 +122,7 @@ def _predicted(spec: ResolutionSpec, result: Result, covariance: FloatArray) -> 
 
 def _errors(spec: ResolutionSpec, found: Result, quiet: Result) -> Row:
     """Rms differences of the fields of two results [px]."""
-    points, _ = spec.sparse
-    x, y = points[:, 0, None], points[:, 1, None]
-    v0, v1phi1 = _changes(quiet, found, points).values()
-    v1 = found.ansatz.v(0, found.unknowns, x, y) - quiet.ansatz.v(0, quiet.unknowns, x, y)
+    v0, v1, v1phi1 = _changes(quiet, found, spec.sparse[0])
     return _rms_px(spec, v0, v1, v1phi1, v0 + v1phi1)
 
 

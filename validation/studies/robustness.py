@@ -15,8 +15,13 @@ from scipy.stats import binomtest
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
-from modeharvest.validation.workers import Case, Cases
+from modeharvest.validation.studies.study import (
+    ImagePairSpec,
+    Study,
+    VirtualImagePair,
+    outcome_of,
+)
+from modeharvest.validation.workers import Case, Cases, Row
 
 SAME_PX = 0.01
 """Solutions nearer than this, rms, are the same minimum [px]."""
@@ -95,23 +100,6 @@ class RobustnessAnalysis:
 
 
 @dataclass(frozen=True)
-class GuessResult:
-    """Where an initial guess leads."""
-
-    distance_px: float
-    start_distance_px: float
-    """Rms length of the difference of the solution's, or the guess', displacement from the
-    reference solution's [px]."""
-    epsilon_percent: float
-    """The paper's, the difference of their norms."""
-    outcome: str
-    iterations: int
-    all_iterations: int
-    residual: float
-    """These four are of the correlation."""
-
-
-@dataclass(frozen=True)
 class RobustnessStudy(Study[RobustnessAnalysis]):
     """Correlate from many initial guesses.
 
@@ -184,18 +172,25 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         return RobustnessAnalysis(moved, at_radius, strains, statistics)
 
 
-def one_start(case: Case, folder: Path) -> GuessResult:
-    """Correlate from one perturbed initial guess, and compare with the reference solution."""
+def one_start(case: Case, folder: Path) -> Row:
+    """Correlate from one perturbed initial guess, and compare with the reference solution.
+
+    ``distance_px``, ``start_distance_px``: rms length of the difference of the solution's, or the
+    guess', displacement from the reference solution's [px]; ``epsilon_percent``: the paper's, the
+    difference of their norms.
+    """
     pair = VirtualImagePair.open(folder, case["images"])
     reference = _reference_solution(folder, case["images"])
     guess = _perturbed_guess(pair, case)
     result = pair.correlate(guess)
     found, size = _field(pair, result.unknowns), _rms(reference)
-    return GuessResult(
-        _rms(found - reference), _rms(_field(pair, guess) - reference),
-        100.0 * abs(size - _rms(found)) / size, result.outcome.value, result.iterations,
-        len(result.history), result.residual_rms,
-    )  # fmt: skip
+    return {
+        "distance_px": _rms(found - reference),
+        "start_distance_px": _rms(_field(pair, guess) - reference),
+        "epsilon_percent": 100.0 * abs(size - _rms(found)) / size,
+        **outcome_of(result),
+        "all_iterations": len(result.history),
+    }
 
 
 def _perturbed_guess(pair: VirtualImagePair, case: Case) -> FloatArray:

@@ -37,7 +37,7 @@ from modeharvest.util.files import read_json
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.truth import Comparison, compare
-from modeharvest.validation.workers import Cases, leave
+from modeharvest.validation.workers import Cases, Row, leave
 
 
 @dataclass(frozen=True)
@@ -191,6 +191,23 @@ class VirtualImagePair:
         """Set a result against the truth and the best fit of its ansatz."""
         guess, camera = self.initial_guess(), self.options.camera
         return compare(self.images, self.strain, result, guess, camera)
+
+    def errors(self, result: Result) -> Row:
+        """Errors of a result against the truth, for a row of a study's table.
+
+        By :meth:`~modeharvest.validation.truth.Comparison.error_parts` and ``v1_percent`` of it.
+        """
+        found = self.compare(result)
+        return {**found.error_parts(), "v1_percent": found.v1_percent(self.specimen)}
+
+
+def outcome_of(result: Result) -> Row:
+    """How a correlation ended, for a row of a study's table."""
+    return {
+        "outcome": result.outcome.value,
+        "iterations": result.iterations,
+        "residual": result.residual_rms,
+    }
 
 
 def noisy(pair: ImagePair, level: float, rng: np.random.Generator, sign: float = 1.0) -> ImagePair:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
@@ -20,9 +20,9 @@ from modeharvest.validation.studies.study import (
     Study,
     StudySetting,
     VirtualImagePair,
+    outcome_of,
 )
-from modeharvest.validation.truth import ErrorParts
-from modeharvest.validation.workers import Case, Cases
+from modeharvest.validation.workers import Case, Cases, Row
 
 T = TypeVar("T")
 _DEGREES = (2, 3, 4, 5, 6, 7, 8)
@@ -48,17 +48,20 @@ class VariedFactor:
     ``names``."""
     change: Callable[[StudySetting, Any], StudySetting]
     """The setting with that level."""
-    base: Callable[[StudySetting], float | None]
-    """The level that a setting has, None where it has none (float images have no bits)."""
+    level_of: Callable[[StudySetting], float | None]
+    """The level that a setting has, None where it has none."""
     whole: bool = False
     """Whether levels are whole numbers."""
+    by_camera: bool = False
+    """Whether only a camera's images have a level: float images have no bits, and no contrast."""
     names: tuple[str, ...] = ()
 
     @classmethod
-    def option(cls, label: str, path: str, levels: tuple[float, ...], whole: bool = False) -> Self:
+    def option(cls, label: str, path: str, levels: tuple[float, ...], **kind: Any) -> Self:
         """The option at a dotted path of a :class:`StudySetting`."""
         at, _, name = path.rpartition(".")
-        return cls(label, levels, lambda s, v: changed(s, at, **{name: v}), attrgetter(path), whole)
+        value = attrgetter(path)
+        return cls(label, levels, lambda s, v: changed(s, at, **{name: v}), value, **kind)
 
     @classmethod
     def choice(cls, label: str, option: str, names: tuple[str, ...]) -> VariedFactor:
@@ -89,7 +92,14 @@ class VariedFactor:
     def set(self, setting: StudySetting, level: float | str) -> StudySetting:
         """Change a setting; InputError if the level is out of the factor's range."""
         number = self.number(level)
-        return self.change(setting, round(number) if self.whole else float(number))
+        other = self.change(setting, round(number) if self.whole else float(number))
+        return changed(other, "correlation", camera=True) if self.by_camera else other
+
+    def base(self, setting: StudySetting) -> float | None:
+        """The level of the images that a setting correlates; None where they have none."""
+        if self.by_camera and not setting.correlation.camera:
+            return None
+        return self.level_of(setting)
 
 
 def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
@@ -103,21 +113,12 @@ def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
 
 
 def _contrast(setting: StudySetting, contrast: float) -> StudySetting:
-    """Grey levels about the same middle, as a camera's: float images know no contrast."""
+    """Grey levels about the same middle."""
     speckle = setting.imaging.speckle
     middle = 0.5 * (speckle.dark + speckle.bright)
     middle = min(max(middle, 0.5 * contrast), 1.0 - 0.5 * contrast)
     dark, bright = middle - 0.5 * contrast, middle + 0.5 * contrast
-    return _by_camera(changed(setting, "imaging.speckle", dark=dark, bright=bright))
-
-
-def _by_camera(setting: StudySetting) -> StudySetting:
-    return changed(setting, "correlation", camera=True)
-
-
-def _camera(setting: StudySetting, level: float) -> float | None:
-    """A level that only a camera's images have."""
-    return level if setting.correlation.camera else None
+    return changed(setting, "imaging.speckle", dark=dark, bright=bright)
 
 
 _option, _choice = VariedFactor.option, VariedFactor.choice
@@ -130,15 +131,13 @@ FACTORS: dict[str, VariedFactor] = {
     ),
     "contrast": VariedFactor(
         "contrast of camera images [fraction of full scale]", (0.05, 0.1, 0.2, 0.4, 0.8),
-        _contrast, lambda s: _camera(s, s.imaging.speckle.bright - s.imaging.speckle.dark),
+        _contrast, lambda s: s.imaging.speckle.bright - s.imaging.speckle.dark, by_camera=True,
     ),
     "blur": _option(
         "blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2.0, 3.0, 4.0, 6.0)
     ),
-    "bits": VariedFactor(
-        "bits of camera images [-]", (4, 6, 8, 10, 12),
-        lambda s, v: _by_camera(changed(s, "imaging", bits=v)),
-        lambda s: _camera(s, s.imaging.bits), whole=True,
+    "bits": _option(
+        "bits of camera images [-]", "imaging.bits", (4, 6, 8, 10, 12), whole=True, by_camera=True
     ),
     "fill_factor": _option(
         "fill factor of the sensor [-]", "imaging.sensor.fill_factor", (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -158,22 +157,6 @@ FACTORS: dict[str, VariedFactor] = {
 
 BASE = "base"
 ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
-
-
-@dataclass(frozen=True)
-class LevelResult(ErrorParts):
-    """What is found at one level of a factor."""
-
-    v1_percent: float
-    """:meth:`~modeharvest.validation.truth.Comparison.v1_percent`."""
-    outcome: str
-    iterations: int
-    residual: float
-    pixels: int
-    pixels_per_ligament: float
-    """Its width [px]."""
-    at_junctions_mm: list[float]
-    """Displacement (x, y) at the junctions between holes [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,21 +278,24 @@ def _moved(done: pd.DataFrame) -> pd.Series:
     return done.apply(moved, axis=1)
 
 
-def one_level(case: Case, folder: Path) -> LevelResult:
-    """Image, correlate and set against the truth; images that no other case needs are removed."""
+def one_level(case: Case, folder: Path) -> Row:
+    """Image, correlate and set against the truth; images that no other case needs are removed.
+
+    Errors as in :meth:`~modeharvest.validation.studies.study.VirtualImagePair.errors`;
+    ``pixels_per_ligament``: its width [px]; ``at_junctions_mm``: displacement (x, y) at the
+    junctions between holes [mm].
+    """
     pair = VirtualImagePair.open(folder, case["images"])
-    specimen = pair.specimen
-    ligament = specimen.largest_diameter - specimen.diameter
+    ligament = pair.specimen.largest_diameter - pair.specimen.diameter
     try:
         result = pair.correlate()
-        comparison = pair.compare(result)
-        return LevelResult(
-            **asdict(comparison.error_parts()), v1_percent=comparison.v1_percent(specimen),
-            outcome=result.outcome.value, iterations=result.iterations,
-            residual=result.residual_rms, pixels=result.pixels,
-            pixels_per_ligament=ligament / pair.images.grid.pixel_size,
-            at_junctions_mm=_at_junctions(pair, result).ravel().tolist(),
-        )  # fmt: skip
+        return {
+            **pair.errors(result),
+            **outcome_of(result),
+            "pixels": result.pixels,
+            "pixels_per_ligament": ligament / pair.images.grid.pixel_size,
+            "at_junctions_mm": _at_junctions(pair, result).ravel().tolist(),
+        }
     finally:
         if not case["keep"]:
             pair.discard()

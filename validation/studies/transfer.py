@@ -80,24 +80,13 @@ def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high
     return float(found)
 
 
-@dataclass(frozen=True, eq=False)
-class PartFields:
-    """Changes of the displacement in the parts of an ansatz, at points."""
-
-    v0: FloatArray
-    v1: FloatArray
-    """(points, 2, waves) of v0 and of v1 phi1 [mm]."""
-
-    @property
-    def whole(self) -> FloatArray:
-        """(points, 2, waves): of the displacement [mm]."""
-        return self.v0 + self.v1
-
-
 def tangent_fit(
     ansatz: Ansatz, unknowns: FloatArray, points: FloatArray, waves: FloatArray
-) -> PartFields:
-    """The best fits of waves (m, 2, k) by an ansatz near some unknowns, at points (m, 2) [mm]."""
+) -> tuple[FloatArray, FloatArray]:
+    """The best fits of waves (m, 2, k) by an ansatz near some unknowns, at points (m, 2) [mm].
+
+    (m, 2, k) each: the changes of v0 and of v1 phi1, which add up to that of the displacement [mm].
+    """
     x, y = points.T
     S = ansatz.sensitivities(unknowns, x[:, None], y[:, None])[:, 0]
     flat = S.reshape(-1, ansatz.size)
@@ -105,7 +94,7 @@ def tangent_fit(
     q, r = np.linalg.qr(flat / scale)
     step = np.linalg.solve(r, q.T @ waves.reshape(len(flat), -1)) / scale[:, None]
     slow = 2 * ansatz.v0_space.size
-    return PartFields(S[..., :slow] @ step[:slow], S[..., slow:] @ step[slow:])
+    return S[..., :slow] @ step[:slow], S[..., slow:] @ step[slow:]
 
 
 def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
@@ -139,11 +128,11 @@ class TransferCurves:
         )  # fmt: skip
         for degree in counted(degrees, progress, "resolution: best fits"):
             ansatz, start = buckled.ansatz(degree, degree), buckled.start(degree, degree)
-            fit = tangent_fit(ansatz, start, points, waves)
+            parts = dict(zip(WAVED, tangent_fit(ansatz, start, points, waves), strict=True))
             for k, (part, axis) in enumerate(kinds):
                 here = slice(k * 2 * _PERIODS, (k + 1) * 2 * _PERIODS)
-                for found, among in ((own, getattr(fit, part)), (whole, fit.whole)):
-                    shares = _over_phases(among[..., here], waves[..., here])
+                for found, fit in ((own, parts[part]), (whole, parts["v0"] + parts["v1"])):
+                    shares = _over_phases(fit[..., here], waves[..., here])
                     found[part, axis, degree] = shares
         return cls(periods, own, whole)
 
@@ -153,12 +142,8 @@ class TransferCurves:
 
     def finest(self, part: str, axis: int, degree: int) -> float:
         """l10 [mm], from which on less than 10 % is lost; InputError if there is no such period."""
-        curve = self.own[part, axis, degree]
-
-        def transfer(period: FloatArray) -> FloatArray:
-            return np.asarray(np.interp(period, self.periods, curve))
-
-        return finest_period(transfer, float(self.periods[0]), float(self.periods[-1]))
+        periods, curve = self.periods, self.own[part, axis, degree]
+        return finest_period(lambda p: np.interp(p, periods, curve), periods[0], periods[-1])
 
     def cross_talk(self) -> tuple[float, float]:
         """Largest share of a wave of one part found in the other: at any period, from l10 on."""
@@ -201,7 +186,8 @@ class Passband:
         itself, error = np.full((2, stretch.size), np.nan)
         for k in np.flatnonzero(np.abs(stretch - 1.0) <= 0.18):
             itself[k], error[k] = _refitted(spec, degree, float(stretch[k]))
-        added = wave_share(tangent_fit(ansatz, start, points, waves).whole, waves)
+        v0, v1 = tangent_fit(ansatz, start, points, waves)
+        added = wave_share(v0 + v1, waves)
         return cls(stretch, added, itself, error)
 
     @property

@@ -21,12 +21,12 @@ from modeharvest.report.model import Findings, KeyNumber, ReportTable, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.noise_statistics import (
     CAUSES,
+    HESSIAN_CORRECTED,
     PARTS,
     Estimate,
     FieldPoints,
     Levels,
     NoiseAnalysis,
-    NoiseFreeCase,
     PairedErrors,
 )
 from modeharvest.validation.studies.study import VirtualImagePair
@@ -88,13 +88,14 @@ def with_errors(summary: pd.DataFrame) -> pd.DataFrame:
     return read
 
 
-def causes_table(levels: Levels, noise_free: NoiseFreeCase) -> pd.DataFrame:
+def causes_table(found: NoiseAnalysis) -> pd.DataFrame:
     """Rms standard deviation or error over the bound, by causes and as measured; by fields."""
+    levels = found.against["bound"]
     first = levels[min(levels)]
     rows: list[dict[str, Any]] = []
     bound: dict[str, float] = {}
     for cause in CAUSES:
-        predicted = noise_free.predicted(cause)
+        predicted = found.predicted[cause]
         squares = {name: predicted[name][first[name].counted] ** 2 for name in PARTS}
         rms = {name: float(np.sqrt(part.mean())) for name, part in squares.items()}
         bound = bound or rms
@@ -278,12 +279,12 @@ def draw_maps(parts: Mapping[str, PairedErrors], points: FieldPoints) -> Figure:
 
 def report_noise(found: NoiseAnalysis, seeds: str) -> Findings:
     """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
-    levels, ours, row = found.by_bound, found.by_least, found.noise_free.row
+    levels, ours, soft = (found.against[cause] for cause in ("bound", "least", HESSIAN_CORRECTED))
     shown, lowest = sorted(levels)[len(levels) // 2], min(levels)
-    summary = summary_table(levels, ours, found.by_hessian, found.points.pair)
-    causes = causes_table(levels, found.noise_free)
+    summary = summary_table(levels, ours, soft, found.points.pair)
+    causes, row = causes_table(found), found.noise_free
     parts = ("w_px", "model_error_px", "measurement_error_px")
-    bars = {"curvature, det F, gradient": ours, "curvature": found.by_hessian, "JᵀJ only": levels}
+    bars = {"curvature, det F, gradient": ours, "curvature": soft, "JᵀJ only": levels}
     names, px = found.points.pair.ansatz.names, found.points.pair.images.grid.pixel_size
     noisy = ", ".join(f"{v:.3f} at {100 * k:g} %" for k, v in found.curvature_sd_ratio.items())
     values = {
