@@ -13,7 +13,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike
 
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 
 
@@ -55,6 +55,16 @@ class Box:
     def centred(cls, width: float, height: float) -> Box:
         """Make the box of this size [mm] around the origin."""
         return cls(-0.5 * width, 0.5 * width, -0.5 * height, 0.5 * height)
+
+    @classmethod
+    def around(cls, x: ArrayLike, y: ArrayLike) -> Box:
+        """Make the smallest box around positions [mm]."""
+        return cls(float(np.min(x)), float(np.max(x)), float(np.min(y)), float(np.max(y)))
+
+    def contains(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """(...) True for positions (...) [mm] inside, or on the border."""
+        inside = (x >= self.x_min) & (x <= self.x_max) & (y >= self.y_min) & (y <= self.y_max)
+        return np.asarray(inside)
 
     @property
     def centre(self) -> tuple[float, float]:

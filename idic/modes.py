@@ -234,7 +234,7 @@ FAMILIES: dict[str, Callable[[Specimen], tuple[ModeFamily, ...]]] = {
 """The families of a specimen's modes, by its stacking."""
 
 
-def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
+def free_family(waves: ArrayLike) -> ModeFamily:
     """Make the family in which every wave has its own five parameters.
 
     An amplitude common to all waves is what v_i already describes, so the largest amplitude of the
@@ -252,7 +252,7 @@ def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
     names = [f"{p}{w + 1}" for w in range(len(full)) for p in ("A", "B", "kx", "ky", "c")]
     units = ["-", "-", "-", "-", "mm"] * len(full)
     return ModeFamily(
-        name,
+        f"{len(full)} wave{'s' * (len(full) != 1)}, free",
         np.eye(flat.size)[:, kept],
         offset,
         flat[kept],

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, square_family
-from modeharvest.idic.photograph.geometry import Geometry, Part, SpecimenTable
+from modeharvest.idic.photograph.geometry import Geometry, Part, Region, SpecimenTable
 from modeharvest.idic.photograph.holes import find_hole_lattice
-from modeharvest.idic.photograph.region import Region
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
 from modeharvest.idic.solver.noise import CameraNoise

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.photograph.holes import find_hole_lattice
-from modeharvest.idic.photograph.region import (
+from modeharvest.idic.photograph.geometry import (
     junction,
     region_of_lattice,
     region_of_mask,
     region_of_polygon,
 )
+from modeharvest.idic.photograph.holes import find_hole_lattice
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.errors import InputError
 

@@ -68,6 +68,11 @@ class LocalField:
         return f" {self.source}" if self.source else ""
 
     @property
+    def points(self) -> FloatArray:
+        """(n, 2) positions [mm]."""
+        return np.column_stack([self.x, self.y])
+
+    @property
     def good(self) -> BoolArray:
         """(n,) True at valid points."""
         assert self.valid is not None  # set when the field was made
@@ -98,7 +103,7 @@ class LocalField:
     @property
     def spacing(self) -> float:
         """Median distance of a point from its nearest neighbour [mm]; infinite for one point."""
-        points = np.column_stack([self.x, self.y])[np.isfinite(self.x) & np.isfinite(self.y)]
+        points = self.points[np.isfinite(self.points).all(axis=1)]
         if len(points) < 2:
             return float("inf")
         return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
@@ -106,8 +111,7 @@ class LocalField:
     @property
     def box(self) -> Box:
         """The smallest box around the valid points [mm]."""
-        x, y = self.x[self.good], self.y[self.good]
-        return Box(float(x.min()), float(x.max()), float(y.min()), float(y.max()))
+        return Box.around(self.x[self.good], self.y[self.good])
 
     def valid_points(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(m,) x, (m,) y and (m, 2) u of the valid points [mm]."""
@@ -115,9 +119,7 @@ class LocalField:
 
     def within(self, region: Box) -> LocalField:
         """The part of the field inside a box; raises InputError if no valid point is there."""
-        inside = (self.x >= region.x_min) & (self.x <= region.x_max)
-        inside &= (self.y >= region.y_min) & (self.y <= region.y_max)
-        return self.selected(inside, "the box")
+        return self.selected(region.contains(self.x, self.y), "the box")
 
     def selected(self, keep: BoolArray, what: str = "the selection") -> LocalField:
         """The points that ``keep`` (n,) names; raises InputError if none of them is valid."""
@@ -138,10 +140,9 @@ class LocalField:
         The model maps (n, 2) points to (n, 2) displacements [mm], as
         ``partial(ansatz.displacement_at, unknowns)`` does.
         """
-        points = np.column_stack([self.x, self.y])
-        where = np.isfinite(points).all(axis=1)
+        where = np.isfinite(self.points).all(axis=1)
         model = np.full(self.u.shape, np.nan)
-        model[where] = displacement(points[where])
+        model[where] = displacement(self.points[where])
         return replace(self, u=self.u - model)
 
     @property

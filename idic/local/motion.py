@@ -80,9 +80,8 @@ def fit_unknowns(
     are fewer components than coefficients.
     """
     a = ansatz.checked(a).copy()
-    x, y, u = field.valid_points()
-    stride = max(1, -(-len(x) // MOST_POINTS))
-    points, u = np.column_stack([x, y])[::stride], u[::stride]
+    stride = max(1, -(-int(field.good.sum()) // MOST_POINTS))
+    points, u = field.points[field.good][::stride], field.u[field.good][::stride]
     free = _low_orders(ansatz, v0_degree, v_degree)
     if 2 * len(points) < free.size:
         raise InputError(

@@ -25,11 +25,12 @@ from modeharvest.idic.finite_element.measure import (
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.local.motion import first_motion
+from modeharvest.idic.local.motion import Slow, first_motion
 from modeharvest.idic.photograph.matching import (
     BLOCKS,
     REACH_PX,
     BlockMatch,
+    expected_by,
     match_blocks,
     require_same_surface,
 )
@@ -155,17 +156,17 @@ def block_motion(
     if match.share < _ENOUGH:
         match = _matched(pair, mesh, known, _FAR_PX)
     require_same_surface(match, *names)
-    added = _less(match.in_mm(pair.grid), mesh, known)
+    added = match.in_mm(pair.grid).less(_at_nearest(mesh, known))
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     slow, _ = first_motion(Box(low[0], high[0], low[1], high[1]), pair, added)
     known = known + slow(mesh.nodes)
-    left = _less(match.in_mm(pair.grid), mesh, known)
+    left = match.in_mm(pair.grid).less(_at_nearest(mesh, known))
     if np.quantile(np.linalg.norm(left.u, axis=1), 0.9) < _CLOSE_PX * pair.grid.pixel_size:
         return known
     dense = _matched(pair, mesh, known, _FAR_PX, _DENSER * BLOCKS)
-    left = _less(dense.in_mm(pair.grid), mesh, known)
-    points, keep = np.column_stack([left.x, left.y]), _like_neighbours(left, pair.grid.pixel_size)
-    spline = RBFInterpolator(points[keep], left.u[keep], neighbors=30)
+    left = dense.in_mm(pair.grid).less(_at_nearest(mesh, known))
+    keep = _like_neighbours(left, pair.grid.pixel_size)
+    spline = RBFInterpolator(left.points[keep], left.u[keep], neighbors=30)
     return np.asarray(known + spline(mesh.nodes))
 
 
@@ -175,8 +176,7 @@ def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:
     The normalised median test of J. Westerweel, F. Scarano, Exp. Fluids 39 (2005), doi
     10.1007/s00348-005-0016-6.
     """
-    points = np.column_stack([blocks.x, blocks.y])
-    around = blocks.u[cKDTree(points).query(points, k=9)[1][:, 1:]]
+    around = blocks.u[cKDTree(blocks.points).query(blocks.points, k=9)[1][:, 1:]]
     median = np.median(around, axis=1)
     spread = np.median(np.linalg.norm(around - median[:, None], axis=-1), axis=1)
     off = np.linalg.norm(blocks.u - median, axis=1)
@@ -187,19 +187,13 @@ def _matched(
     pair: ImagePair, mesh: Mesh, u: FloatArray, reach_px: int, count: int = BLOCKS
 ) -> BlockMatch:
     """Blocks, looked for around where displacements u (n, 2) of the nodes [mm] take them."""
+    return match_blocks(pair, expected_by(_at_nearest(mesh, u), pair.grid), reach_px, count)
+
+
+def _at_nearest(mesh: Mesh, u: FloatArray) -> Slow:
+    """Displacements u (n, 2) of the nodes [mm] anywhere: those of the nearest node."""
     tree = cKDTree(mesh.nodes)
-
-    def moved(points: FloatArray) -> FloatArray:
-        at = np.column_stack(pair.grid.to_mm(*points.T))
-        return np.column_stack(pair.grid.to_px(*(at + u[tree.query(at)[1]]).T))
-
-    return match_blocks(pair.reference, pair.deformed, pair.mask, moved, reach_px, count)
-
-
-def _less(blocks: LocalField, mesh: Mesh, u: FloatArray) -> LocalField:
-    """What blocks have moved beyond displacements u (n, 2) of the nodes [mm]."""
-    nearest = cKDTree(mesh.nodes).query(np.column_stack([blocks.x, blocks.y]))[1]
-    return replace(blocks, u=blocks.u - u[nearest])
+    return lambda points: np.asarray(u[tree.query(points)[1]])
 
 
 def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) -> BoolArray | None:

@@ -1,33 +1,24 @@
-"""Geometry of a photographed specimen: hole lattice, cellular parts, and where they have moved."""
+"""Geometry of a photographed specimen: its cellular part, its boundary, the lattice of its holes.
+
+The cellular part comes from the lattice of the holes, from a polygon drawn by hand, or from a
+mask image; modes live there. The domain of v0 is the whole specimen as far as the image shows it.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import find_objects, label
+from skimage.draw import polygon2mask
 
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
-from modeharvest.idic.photograph.matching import (
-    BlockMatch,
-    Expected,
-    HoleMotion,
-    match_blocks,
-    possible_motions,
-    require_same_surface,
-)
-from modeharvest.idic.photograph.region import (
-    Region,
-    region_of_lattice,
-    region_of_mask,
-    region_of_polygon,
-)
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -105,6 +96,145 @@ class SpecimenTable:
             )
 
 
+SIDES = ("left", "right", "bottom", "top")
+_FILLED = 0.9
+"""Share of its bounding box below which a region is not nearly a rectangle."""
+_SOME = 0.01
+"""A region with less material than this share of itself is a mistake."""
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """The cellular part of a specimen."""
+
+    cellular: Box
+    """Smallest axis-parallel box around the cellular part [mm]."""
+    domain: Box
+    """Box around all material in the image [mm]."""
+    text: tuple[str, ...]
+    """Where the region comes from, and what is odd about it."""
+
+
+def region_of_lattice(lattice: HoleLattice, mask: ArrayLike, grid: PixelGrid) -> Region:
+    """Make the region from the holes: every hole's cell, half a lattice vector each way.
+
+    Lattice and mask, (rows, cols) True on material, are of the reference.
+    """
+    reach = 0.5 * np.abs(lattice.vectors).max(axis=0)  # rows and columns of a cell
+    low, high = lattice.centres.min(axis=0) - reach, lattice.centres.max(axis=0) + reach
+    text = (
+        f"The cellular part is the cells of {len(lattice)} holes on a {lattice.kind} lattice of "
+        f"{lattice.pitch_px * grid.pixel_size:.4g} mm."
+    )
+    return _region(low, high, mask, grid, text)
+
+
+def region_of_polygon(polygon: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
+    """Make the region from a polygon drawn by hand, (n, 2) corners in order, (row, col) [px].
+
+    Raises InputError if it has no area, leaves the image, or holds hardly any material.
+    """
+    corners = np.asarray(polygon, dtype=np.float64)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise InputError(
+            "expected a polygon of at least three corners (row, col) [px], got shape "
+            f"{corners.shape}"
+        )
+    last = np.array(grid.shape) - 0.5
+    if not np.isfinite(corners).all() or (corners < -0.5).any() or (corners > last).any():
+        raise InputError(
+            f"expected a polygon inside the image of {grid.rows} x {grid.cols} px, got corners "
+            f"from {corners.min(axis=0).tolist()} to {corners.max(axis=0).tolist()} (row, col)"
+        )
+    inside = np.asarray(polygon2mask(grid.shape, corners))  # type: ignore[no-untyped-call]
+    _require_material(inside, np.asarray(mask, dtype=np.bool_), "polygon")
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    text = f"The cellular part is a polygon of {len(corners)} corners, as given."
+    return _region(low, high, mask, grid, text, *_unlike_box(inside, low, high))
+
+
+def region_of_mask(region: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
+    """Make the region from a mask image (rows, cols): True where the specimen is cellular.
+
+    Raises InputError if it has another size, or holds hardly any material.
+    """
+    inside = np.asarray(region, dtype=np.bool_)
+    if inside.shape != grid.shape:
+        raise InputError(
+            f"expected a mask of the cellular part of {grid.rows} x {grid.cols} px like the "
+            f"images, got shape {inside.shape}"
+        )
+    _require_material(inside, np.asarray(mask, dtype=np.bool_), "mask of the cellular part")
+    low, high = _bounds(inside)
+    if min(high - low) < 2.0:
+        raise InputError("expected a cellular part with an area, got pixels that lie in one line")
+    text = "The cellular part is a mask image, as given."
+    return _region(low, high, mask, grid, text, *_unlike_box(inside, low, high))
+
+
+def junction(lattice: HoleLattice, grid: PixelGrid) -> tuple[float, float]:
+    """(x, y) [mm] of a solid junction between holes, where the paper puts a mode's origin."""
+    x, y = grid.to_mm(*lattice.position((0.5, 0.5)))
+    return float(x), float(y)
+
+
+def _region(
+    low: FloatArray, high: FloatArray, mask: ArrayLike, grid: PixelGrid, *text: str
+) -> Region:
+    """The region of a cellular part between two (row, col) [px], in the specimen of a mask."""
+    least, most = _bounds(_largest_part(np.asarray(mask, dtype=np.bool_)))
+    cut = (least[1] < 0.5, most[1] > grid.cols - 1.5, most[0] > grid.rows - 1.5, least[0] < 0.5)
+    if any(cut):
+        sides = ", ".join(side for side, outside in zip(SIDES, cut, strict=True) if outside)
+        text = (*text, f"The specimen leaves the image at the {sides}.")
+    # Half a cell of rounding or of a crooked edge must not make the domain the smaller one.
+    domain = _box(np.minimum(low, least), np.maximum(high, most), grid)
+    return Region(_box(low, high, grid), domain, text)
+
+
+def box_of(mask: BoolArray, grid: PixelGrid) -> Box:
+    """The box along the outer edges of the pixels of a mask [mm]."""
+    return _box(*_bounds(mask), grid)
+
+
+def _bounds(mask: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest (row, col) of the outer edges of a mask's pixels [px]."""
+    rows, cols = find_objects(mask.astype(np.uint8))[0]
+    return (
+        np.array([rows.start - 0.5, cols.start - 0.5]),
+        np.array([rows.stop - 0.5, cols.stop - 0.5]),
+    )
+
+
+def _largest_part(mask: BoolArray) -> BoolArray:
+    """The largest connected part of the material."""
+    parts, count = label(mask)
+    if count == 0:
+        raise InputError("expected material in the mask, got a mask with nothing in it")
+    return np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
+
+
+def _box(low: FloatArray, high: FloatArray, grid: PixelGrid) -> Box:
+    """The box [mm] between two (row, col) [px]."""
+    return Box.around(*grid.to_mm([low[0], high[0]], [low[1], high[1]]))
+
+
+def _require_material(inside: BoolArray, mask: BoolArray, what: str) -> None:
+    share = float(mask[inside].mean()) if inside.any() else 0.0
+    if share < _SOME:
+        raise InputError(
+            f"expected material inside the {what}, got {100 * share:.1f} % of it; is it given as "
+            "(row, col) with rows downwards?"
+        )
+
+
+def _unlike_box(inside: BoolArray, low: FloatArray, high: FloatArray) -> list[str]:
+    share = inside.sum() / float(np.prod(high - low))
+    if share >= _FILLED:
+        return []
+    return [f"It fills {100 * share:.0f} % of its bounding box, on which the modes are set up."]
+
+
 _UPRIGHT_DEG = 1.0
 _OVERLAP = 0.5
 """Cells by which the boxes of two parts may overlap; so wide are the tapers of their modes."""
@@ -166,11 +296,11 @@ def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: 
         for r in table.regions
     )
     _require_apart(given, table.cell_size)
-    region = _region(table, lattice, mask, grid, base)
+    region = _cellular(table, lattice, mask, grid, base)
     return Geometry(grid, mask, lattice, region, given or (Part("", region.cellular),))
 
 
-def _region(
+def _cellular(
     table: SpecimenTable,
     lattice: HoleLattice | None,
     mask: BoolArray,
@@ -213,48 +343,3 @@ def _require_apart(parts: tuple[Part, ...], cell_size: float) -> None:
                 f"specimen.regions: expected parts beside each other, got {one.name!r} and "
                 f"{other.name!r}, whose boxes overlap by {shared:.3g} mm; draw them apart"
             )
-
-
-def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | None, str]:
-    """How the holes have moved, and a text about it; None where they can't be followed.
-
-    Where a column of holes has left the image, the holes alone allow several answers; the speckle
-    between them decides. Raises InputError if the images don't show the same surface.
-    """
-    if geometry.lattice is None:
-        return None, "The reference shows no lattice of holes to follow."
-    try:
-        motions = possible_motions(geometry.lattice, find_hole_lattice(pair.masks[1]))
-    except InputError as error:
-        return None, f"The holes could not be followed: {error}."
-    tied = motions[0].rivals + 1
-    motion, blocks = best = _best(pair, motions[:tied])
-    if not blocks.is_same and len(motions) > tied:  # those that match fewer holes
-        motion, blocks = max(best, _best(pair, motions[tied:]), key=_share)
-    require_same_surface(blocks, "the reference", "the deformed one")
-    text = [*motion.text, blocks.text]
-    if motion is not motions[0] or motion.rivals:
-        text.append("Which hole is which was decided by the speckle between them.")
-    return motion, " ".join(text)
-
-
-def confirmed_by_speckle(pair: ImagePair, expected: Expected) -> str:
-    """A text about blocks of the reference that were found where they are expected.
-
-    Raises InputError if the images don't show the same surface.
-    """
-    blocks = match_blocks(pair.reference, pair.deformed, pair.mask, expected)
-    require_same_surface(blocks, "the reference", "the deformed one")
-    return blocks.text
-
-
-def _best(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, BlockMatch]:
-    """The motion that the speckle agrees with best."""
-    return max(
-        ((m, match_blocks(pair.reference, pair.deformed, pair.mask, m.at)) for m in motions),
-        key=_share,
-    )
-
-
-def _share(found: tuple[HoleMotion, BlockMatch]) -> float:
-    return found[1].share

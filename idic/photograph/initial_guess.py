@@ -19,7 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
+from modeharvest.fem.lattice.options import lattice_vectors
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.chebyshev import Box, Brightness
 from modeharvest.idic.local.field import LocalField
@@ -31,8 +33,8 @@ from modeharvest.idic.local.motion import (
     fit_unknowns,
 )
 from modeharvest.idic.modes import ModeFamily, Taper, free_family, square_family
-from modeharvest.idic.photograph.geometry import Geometry
-from modeharvest.idic.photograph.region import WRONG_CELL, Cells, box_of, junction
+from modeharvest.idic.photograph.geometry import Geometry, box_of, junction
+from modeharvest.idic.photograph.holes import find_holes
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.spectra.pattern import WavePattern, nearest_origin, read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum
@@ -47,20 +49,6 @@ SAME_WAVE = 0.15
 """Distance [1/l] within which two wave vectors are one, up to a reciprocal lattice vector."""
 AMPLITUDE_DEGREE = 2
 """Total degree of every v_i at first: strongest in the middle, weaker at clamped edges."""
-FIXED_AMPLITUDE = 1.0
-"""v_i where no pattern is observable [mm]; the paper's: 40 um with max ||phi|| = 0.04."""
-
-
-@dataclass(frozen=True, eq=False)
-class InitialMode:
-    """A mode of an initial guess."""
-
-    family: ModeFamily
-    """Its start is the pattern."""
-    amplitude: float
-    """What the family's waves at its start are to be multiplied by, with sign [mm]."""
-    box: Box
-    """The region [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +57,8 @@ class RegionPattern:
 
     pattern: WavePattern
     """What the spectrum of the field there shows."""
-    modes: tuple[InitialMode, ...]
-    """Of the ansatz; those of all regions follow one another."""
+    modes: tuple[ModeFamily, ...]
+    """Each starts as the pattern; in the ansatz those of all regions follow one another."""
 
     @property
     def text(self) -> tuple[str, ...]:
@@ -139,19 +127,19 @@ def initial_guess(
         share = 100 * local.valid_share
         text = [f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid."]
     regions = tuple(_region_pattern(local, box, cells) for box in boxes)
-    modes = [mode for region in regions for mode in region.modes]
+    modes = [(m, box) for box, part in zip(boxes, regions, strict=True) for m in part.modes]
     text += [line for region in regions for line in region.text]
     fixed = not modes
     if fixed and cells.square:
-        modes = [InitialMode(fixed_square(cells), 0.0, boxes[0])]
+        modes = [(fixed_square(cells), boxes[0])]
         text.append(
             "The mode is fixed at the square pattern that the lattice of holes allows: without a "
             "pattern, its parameters aren't observable."
         )
     elif fixed:
         text.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
-    ansatz, a = _assembled(modes, cell_size, domain, options)
-    fit = _fitted(ansatz, a, local, fixed)
+    ansatz = Ansatz.on(domain, modes, cell_size, options)
+    fit = _fitted(ansatz, local, fixed)
     fitted = " and ".join(["v0", *(f"v{i + 1}" for i in range(0 if fixed else len(modes)))])
     text.append(
         f"{fitted} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
@@ -160,12 +148,112 @@ def initial_guess(
     return InitialGuess(ansatz, fit.coefficients, regions, local, fixed, tuple(text))
 
 
+NEARLY_SQUARE = 0.05
+"""Relative difference of lengths, and cosine between directions, of a square lattice's vectors."""
+WRONG_CELL = 0.07
+"""Relative difference of a cell size given from one found, beyond which they contradict each
+other: over the paper's six cells the phase of its mode drifts by 1.3 rad, and a correlation may
+settle in a local minimum. A measured field's peaks are known to a few hundredths."""
+_FEWEST_HOLES = 4
+_SMALLEST_HOLE = 0.01
+"""Area of a hole [cells] below which it is a speck in the mask."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The lattice of holes."""
+
+    cell_size: float
+    """l, the distance of neighbouring holes [mm]."""
+    vectors: FloatArray
+    """(2, 2) lattice vectors as rows [mm]."""
+    given: bool
+    """Whether they were given, or are square for want of better knowledge."""
+    junction: FloatArray
+    """(2,) the middle of the solid between four holes [mm]."""
+
+    @classmethod
+    def found(
+        cls,
+        cell_size: float,
+        lattice: ArrayLike | None,
+        pair: ImagePair,
+        boxes: Sequence[Box],
+        holes: LocalField | None,
+    ) -> Cells:
+        """Take what is given, and the rest from the mask; raises InputError if they differ."""
+        if not cell_size > 0:
+            raise InputError(f"initial guess: expected a positive cell size, got {cell_size} mm")
+        vectors = _matching_vectors(cell_size, lattice)
+        centres = np.zeros((0, 2)) if holes is None else holes.points
+        if holes is None and pair.mask is not None and not pair.mask.all():
+            centres = hole_centres(pair, boxes, cell_size)
+        centres = centres[np.isfinite(centres).all(axis=1)]
+        if len(centres) >= _FEWEST_HOLES:
+            apart = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
+            found = f"{apart:.3g} mm between neighbours of {len(centres)} holes"
+            _require_hole_distance(apart, cell_size, found)
+        corner = np.array([boxes[0].x_min, boxes[0].y_min])
+        hole = _middle_hole(centres, vectors) if len(centres) else corner + vectors.sum(axis=0) / 2
+        junction = np.asarray(hole - 0.5 * vectors.sum(axis=0))
+        return cls(cell_size, vectors, lattice is not None, junction)
+
+    @property
+    def square(self) -> bool:
+        """Whether the lattice vectors are as long as each other, and at right angles."""
+        a, b = np.linalg.norm(self.vectors, axis=1)
+        cosine = abs(self.vectors[0] @ self.vectors[1]) / (a * b)
+        return bool(abs(a - b) <= NEARLY_SQUARE * a and cosine <= NEARLY_SQUARE)
+
+
+def hole_centres(pair: ImagePair, boxes: Sequence[Box], cell_size: float) -> FloatArray:
+    """(n, 2) centres of the holes of the reference that lie in boxes [mm]; specks are left out."""
+    holes = find_holes(pair.masks[0], _SMALLEST_HOLE * (cell_size / pair.grid.pixel_size) ** 2)
+    x, y = pair.grid.to_mm(*holes.centres.T)
+    return np.vstack([np.column_stack([x, y])[box.contains(x, y)] for box in boxes])
+
+
+def _require_hole_distance(apart: float, cell_size: float, found: str) -> None:
+    """Raise InputError if neighbouring holes, so far ``apart`` [mm], are not a cell size apart."""
+    if abs(apart - cell_size) > WRONG_CELL * cell_size:
+        raise InputError(
+            f"initial guess: expected holes {cell_size:g} mm apart, the cell size given, got "
+            f"{found}; give cell size {apart:.3g} mm, or check the pixel size"
+        )
+
+
+def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(2,) where the hole in the middle should be, by itself and its neighbours [mm]."""
+    middle = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
+    steps = np.linalg.solve(vectors.T, (centres - middle).T).T
+    near = np.abs(steps).max(axis=1) < 1.5
+    return np.asarray((centres - np.round(steps) @ vectors)[near].mean(axis=0))
+
+
+def _matching_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
+    """(2, 2) vectors of the lattice of holes as rows [mm], the first one nearest to the x axis.
+
+    Raises InputError if it isn't one, or its shortest distance isn't the cell size within 7 %.
+    """
+    if lattice is None:
+        return cell_size * np.eye(2)
+    vectors = lattice_vectors(lattice, "initial guess")
+    i = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), axis=-1).reshape(-1, 2)
+    lengths = np.linalg.norm(i[np.any(i != 0, axis=1)] @ vectors, axis=1)
+    shortest = float(lengths.min())
+    _require_hole_distance(shortest, cell_size, f"a lattice of holes {shortest:.3g} mm apart")
+    if np.prod(np.abs(np.diag(vectors[::-1]))) > np.prod(np.abs(np.diag(vectors))):
+        vectors = vectors[::-1]
+    signs = np.where(np.diag(vectors) < 0, -1.0, 1.0)
+    return np.asarray(vectors * signs[:, None])
+
+
 def _region_pattern(local: LocalField, box: Box, cells: Cells) -> RegionPattern:
     """Find the pattern of one region in the field's spectrum there, and make its modes."""
     pattern = read_pattern(measured_spectrum(local, cells.cell_size, box))
     if not cells.given:
         require_cell_size(pattern, cells.cell_size)
-    return RegionPattern(pattern, tuple(modes_of(pattern, cells, box)))
+    return RegionPattern(pattern, tuple(modes_of(pattern, cells)))
 
 
 def require_cell_size(pattern: WavePattern, cell_size: float) -> None:
@@ -187,16 +275,14 @@ def require_cell_size(pattern: WavePattern, cell_size: float) -> None:
         )
 
 
-def modes_of(pattern: WavePattern, cells: Cells, box: Box) -> list[InitialMode]:
+def modes_of(pattern: WavePattern, cells: Cells) -> list[ModeFamily]:
     """Modes for the waves of a pattern: the paper's family if it is the square one, else free ones.
 
     Waves whose vectors differ by one of the reciprocal lattice are coupled by the holes, and make
     one mode; any others share nothing, and each group has a mode, and an amplitude v, of its own.
     """
     if pattern.start is not None:
-        family, sign = nearest_origin(pattern.start, cells.cell_size)
-        amplitude = sign * pattern.start_amplitude
-        return [InitialMode(replace(family, name="square"), amplitude, box)]
+        return [replace(nearest_origin(pattern.start, cells.cell_size), name="square")]
     groups: list[list[PlaneWave]] = []
     for wave in pattern.waves:
         group = next((g for g in groups if _coupled(g[0], wave, cells)), None)
@@ -204,7 +290,7 @@ def modes_of(pattern: WavePattern, cells: Cells, box: Box) -> list[InitialMode]:
             groups.append([wave])
         else:
             group.append(wave)
-    return [_free_mode(group, box) for group in groups]
+    return [_free_mode(group) for group in groups]
 
 
 def _coupled(one: PlaneWave, other: PlaneWave, cells: Cells) -> bool:
@@ -218,12 +304,10 @@ def _coupled(one: PlaneWave, other: PlaneWave, cells: Cells) -> bool:
     return False
 
 
-def _free_mode(waves: list[PlaneWave], box: Box) -> InitialMode:
+def _free_mode(waves: list[PlaneWave]) -> ModeFamily:
     rows = np.array([w.row for w in waves])
-    amplitude = float(np.abs(rows[:, :2]).max())
-    rows[:, :2] /= amplitude
-    count = "1 wave" if len(waves) == 1 else f"{len(waves)} waves"
-    return InitialMode(free_family(rows, f"{count}, free"), amplitude, box)
+    rows[:, :2] /= np.abs(rows[:, :2]).max()
+    return free_family(rows)
 
 
 def fixed_square(cells: Cells) -> ModeFamily:
@@ -233,20 +317,9 @@ def fixed_square(cells: Cells) -> ModeFamily:
     return replace(square_family(), start=start).moved(cells.junction).fixed()
 
 
-def _assembled(
-    modes: Sequence[InitialMode], cell_size: float, domain: Box, options: AnsatzOptions
-) -> tuple[Ansatz, FloatArray]:
-    """The ansatz, and unknowns in which every v_i is a constant."""
-    ansatz = Ansatz.on(domain, [(m.family, m.box) for m in modes], cell_size, options)
-    a = ansatz.initial_guess()
-    for i, mode in enumerate(modes):
-        a[ansatz.v_slice(i)][0] = mode.amplitude / ansatz.modes[i].scale or FIXED_AMPLITUDE
-    return ansatz, a
-
-
-def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, fixed: bool) -> RobustFit:
+def _fitted(ansatz: Ansatz, local: LocalField, fixed: bool) -> RobustFit:
     """v0 and every v_i through the field; a mode that isn't observable isn't fitted."""
-    slow = min(SLOW_DEGREE, ansatz.v0_degree)
+    a, slow = ansatz.initial_guess(), min(SLOW_DEGREE, ansatz.v0_degree)
     if not fixed:
         return fit_unknowns(ansatz, a, local, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
     alone = replace(ansatz, modes=(), brightness=Brightness())
@@ -293,14 +366,14 @@ def shows_more(
     now: Ansatz, unknowns: FloatArray, before: Ansatz, unknowns_before: FloatArray
 ) -> bool:
     """Whether a part of the specimen shows a wave that it did not show before."""
-
-    def known(taper: Taper, xi: FloatArray) -> bool:
-        return any(
+    known = _waves(before, unknowns_before)
+    return not all(
+        any(
             taper == other and 0.5 * min(map(np.linalg.norm, (xi - k, xi + k))) <= SAME_WAVE
-            for other, k in _waves(before, unknowns_before)
+            for other, k in known
         )
-
-    return not all(known(*wave) for wave in _waves(now, unknowns))
+        for taper, xi in _waves(now, unknowns)
+    )
 
 
 def _waves(ansatz: Ansatz, unknowns: FloatArray) -> list[tuple[Taper, FloatArray]]:

@@ -11,7 +11,7 @@ the reference, or the motion is larger than expected.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -22,8 +22,10 @@ from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import distance_transform_cdt, map_coordinates
 
 from modeharvest.idic.local.field import LocalField, field_between
-from modeharvest.idic.photograph.holes import HoleLattice
+from modeharvest.idic.local.motion import Slow
+from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
 from modeharvest.util.errors import InputError
 
@@ -141,6 +143,17 @@ def _motion(
 Expected = Callable[[FloatArray], FloatArray]
 """From (n, 2) (row, col) in the reference to (n, 2) (row, col) in the deformed image [px]."""
 
+
+def expected_by(displacement: Slow, grid: PixelGrid) -> Expected:
+    """Where a displacement [mm] takes positions of the reference."""
+
+    def moved(points: FloatArray) -> FloatArray:
+        before = np.column_stack(grid.to_mm(*points.T))
+        return np.column_stack(grid.to_px(*(before + displacement(before)).T))
+
+    return moved
+
+
 BLOCKS, BLOCK_PX, SMALLEST_PX = 120, 41, 15
 """About so many blocks of such an edge, smaller where ligaments are too narrow for it."""
 REACH_PX = 24
@@ -197,29 +210,19 @@ class BlockMatch:
 
 
 def match_blocks(
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    mask: ArrayLike | None = None,
-    expected: Expected | None = None,
-    reach_px: int = REACH_PX,
-    count: int = BLOCKS,
+    pair: ImagePair, expected: Expected, reach_px: int = REACH_PX, count: int = BLOCKS
 ) -> BlockMatch:
-    """Look for blocks of the reference in the deformed image, (rows, cols) both.
+    """Look for blocks of the reference's material in the deformed image.
 
-    InputError if the images' sizes differ or there is no room for blocks.
+    InputError if there is no room for blocks.
 
-    mask : (rows, cols) True on material of the reference; blocks lie in it. Everywhere by default.
-    expected : Where positions should have moved to, as ``HoleMotion.at`` gives it; nowhere by
-        default.
+    expected : Where positions should have moved to, as ``HoleMotion.at`` gives it.
     reach_px : How far from there a block is searched for, along rows and columns [px].
     count : About how many blocks an image would hold.
     """
-    f, g = (np.asarray(image, dtype=np.float32) for image in (reference, deformed))
-    if f.ndim != 2 or f.shape != g.shape:
-        raise InputError(f"expected two images of one size, got {f.shape} and {g.shape}")
-    material = np.ones(f.shape, dtype=np.bool_) if mask is None else np.asarray(mask, np.bool_)
-    centres, half = _blocks(material, count)
-    aims = centres if expected is None else np.rint(expected(centres.astype(np.float64)))
+    f, g = pair.reference, pair.deformed
+    centres, half = _blocks(pair.masks[0], count)
+    aims = np.rint(expected(centres.astype(np.float64)))
     inside = ((aims >= half) & (aims < np.array(f.shape) - half)).all(axis=1)
     centres, aims = centres[inside], aims[inside].astype(np.int64)
     if len(centres) < 4:
@@ -239,7 +242,9 @@ def match_blocks(
     )
 
 
-def require_same_surface(match: BlockMatch, reference: str, deformed: str) -> None:
+def require_same_surface(
+    match: BlockMatch, reference: str = "the reference", deformed: str = "the deformed one"
+) -> None:
     """Raise InputError unless two images, named for the message, show the same surface."""
     if not match.is_same:
         raise InputError(
@@ -247,6 +252,38 @@ def require_same_surface(match: BlockMatch, reference: str, deformed: str) -> No
             f"{int(match.found.sum())} of {len(match.found)} blocks agree; the reference is not "
             "the reference, or the motion is too large: give frames in between"
         )
+
+
+def matched_holes(pair: ImagePair, lattice: HoleLattice | None) -> tuple[HoleMotion | None, str]:
+    """How the reference's holes have moved, and a text about it; None where it isn't known.
+
+    Where a column of holes has left the image, the holes alone allow several answers; the speckle
+    between them decides. Raises InputError if the images don't show the same surface.
+    """
+    if lattice is None:
+        return None, "The reference shows no lattice of holes to follow."
+    try:
+        motions = possible_motions(lattice, find_hole_lattice(pair.masks[1]))
+    except InputError as error:
+        return None, f"The holes could not be followed: {error}."
+    tied = motions[0].rivals + 1
+    motion, blocks = _best(pair, motions[:tied])
+    if not blocks.is_same and len(motions) > tied:  # those that match fewer holes
+        other, others_blocks = _best(pair, motions[tied:])
+        if others_blocks.share > blocks.share:
+            motion, blocks = other, others_blocks
+    require_same_surface(blocks)
+    text = [*motion.text, blocks.text]
+    if motion is not motions[0] or motion.rivals:
+        text.append("Which hole is which was decided by the speckle between them.")
+    return motion, " ".join(text)
+
+
+def _best(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, BlockMatch]:
+    """The motion that the speckle agrees with best."""
+    matches = [match_blocks(pair, motion.at) for motion in motions]
+    best = int(np.argmax([match.share for match in matches]))
+    return motions[best], matches[best]
 
 
 def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:

@@ -18,12 +18,18 @@ from numpy.typing import NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.photograph.geometry import Geometry, confirmed_by_speckle, matched_holes
+from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
     chosen_modes,
     initial_guess,
     shows_more,
+)
+from modeharvest.idic.photograph.matching import (
+    expected_by,
+    match_blocks,
+    matched_holes,
+    require_same_surface,
 )
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import PhotographOptions
@@ -116,12 +122,14 @@ def measure(
         its ansatz is kept and its unknowns are the initial guess; if that doesn't converge, one is
         found anew.
     """
-    motion, matching = matched_holes(pair, geometry)
+    motion, matching = matched_holes(pair, geometry.lattice)
     holes = None if motion is None else motion.in_mm(geometry.grid)
     if motion is None and before is not None:
         holes = _moved_holes(before.result, geometry)
-        matching += " v0 starts from the photograph before. "
-        matching += confirmed_by_speckle(pair, partial(_moved_to, before.result))
+        known = partial(before.result.ansatz.displacement_at, before.result.unknowns)
+        blocks = match_blocks(pair, expected_by(known, pair.grid))
+        require_same_surface(blocks)
+        matching += f" v0 starts from the photograph before. {blocks.text}"
     boxes = [part.box for part in geometry.parts]
     guess = initial_guess(
         pair, cell_size, boxes, local=local, holes=holes, lattice=geometry.lattice_mm,
@@ -185,14 +193,6 @@ def _moved_holes(result: Result, geometry: Geometry) -> LocalField | None:
     x, y = geometry.grid.to_mm(*geometry.lattice.centres.T)
     v0 = result.ansatz.v0(result.unknowns, x[:, None], y[:, None])[:, 0]
     return LocalField(x, y, v0, source="v0 at the holes")
-
-
-def _moved_to(result: Result, points: FloatArray) -> FloatArray:
-    """(n, 2) (row, col) that positions (n, 2) of the reference have moved to [px]."""
-    grid = result.grid
-    before = np.column_stack(grid.to_mm(*points.T))
-    moved = before + result.ansatz.displacement_at(result.unknowns, before)
-    return np.column_stack(grid.to_px(*moved.T))
 
 
 _BAND = 64

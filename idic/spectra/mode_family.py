@@ -164,7 +164,7 @@ def mode_family(
     if shared:
         family = as_square(rows, pitch) or tied_family(count, waves, ties, pitch)
     else:
-        family = free_family(rows, f"{count}, free")
+        family = free_family(rows)
     phi = wave_values(rule, family.waves(family.start), pitch)
     amplitude, captured = best_amplitude(rule, u, phi)
     text = describe(selection, waves, ties if shared else [], family, captured)
@@ -185,7 +185,7 @@ def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
     equal = np.all(np.abs(np.diff(np.abs(amplitudes), axis=0)) <= same)
     if not (diagonal and equal and amplitudes.prod() < 0):
         return None
-    return nearest_origin(square_parameters(waves, pitch)[0], pitch)[0]
+    return nearest_origin(square_parameters(waves, pitch)[0], pitch)
 
 
 FORMAT = "modeharvest-family-1"

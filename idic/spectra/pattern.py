@@ -66,19 +66,16 @@ def mode_deviation(
     return 100 * difference
 
 
-def nearest_origin(mode: ArrayLike, pitch: float) -> tuple[ModeFamily, int]:
-    """Eq. (mode) with the start that is a given mode, its origin where the phases are smaller.
-
-    The sign is what v₁ takes.
-    """
+def nearest_origin(mode: ArrayLike, pitch: float) -> ModeFamily:
+    """Eq. (mode) with the start that is a given mode, its origin where the phases are smaller."""
     found = []
     for origin in ("junction", "hole"):
         family = square_family(origin)
-        start, sign = mode_equivalent(mode, pitch, family.start)
+        start, _ = mode_equivalent(mode, pitch, family.start)
         off = float(np.abs(start[5:]).max()) / pitch
         name = family.name if off <= SAME_PHASE else "square"
-        found.append((round(off, 9), replace(family, name=name, start=start), sign))
-    return min(found, key=lambda f: f[0])[1:]
+        found.append((round(off, 9), replace(family, name=name, start=start)))
+    return min(found, key=lambda f: f[0])[1]
 
 
 def square_parameters(waves: FloatArray, pitch: float) -> tuple[FloatArray, float]:
