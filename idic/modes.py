@@ -302,12 +302,6 @@ class FourierMode:
             raise InputError(f"mode family {family.name!r}: the start gives a mode that is zero")
         return cls(family, half_wavelength, _LARGEST / largest, taper)
 
-    def phases(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
-        """(w, ...): theta_w [rad] at positions [mm] that broadcast together."""
-        waves = self.family.waves(parameters)
-        per_mm = np.pi / self.half_wavelength
-        return np.stack([per_mm * (w[2] * x + w[3] * y + w[4]) for w in waves])
-
     def evaluate(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
         """(..., 2): phi [-] along x and y, at positions [mm] that broadcast together."""
         taper_x, taper_y = self.scale * self.taper.along_x(x), self.taper.along_y(y)
@@ -337,8 +331,8 @@ class FourierMode:
         waves = self.family.waves(parameters)
         per_mm = np.pi / self.half_wavelength
         full = np.zeros((*x.shape, 2, PER_WAVE * len(waves)))
-        for w, theta in enumerate(self.phases(parameters, x, y)):
-            k = PER_WAVE * w
+        for w, (_, _, kx, ky, c) in enumerate(waves):
+            k, theta = PER_WAVE * w, per_mm * (kx * x + ky * y + c)
             full[..., 0, k] = full[..., 1, k + 1] = np.sin(theta)
             slope = per_mm * np.cos(theta)[..., None] * waves[w, :2]
             full[..., k + 2], full[..., k + 3] = slope * x[..., None], slope * y[..., None]

@@ -5,7 +5,7 @@ Null is infinity, or NaN.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ from modeharvest.util.typed import to_plain
 
 FORMAT = "modeharvest-result-5"
 
+_BAND = 64
+"""Rows that are warped back at a time, so that little memory is needed."""
 _MOST_NOISE = 0.8
 """Of a mean square slope no more is taken for noise: where noise is all there is, the estimate of
 what is not would be nothing."""
@@ -253,11 +255,18 @@ class Result:
         """
         if pair.grid.shape != self.grid.shape:
             raise InputError(f"expected images of {self.grid.shape} px, got {pair.grid.shape}")
-        u = self.displacement() / self.grid.pixel_size
-        row, col = np.indices(self.grid.shape)
-        value, _, _ = SplineImage.of(pair.deformed, order).sample(row - u[..., 1], col + u[..., 0])
-        gain, offset = self.ansatz.gain_and_offset(self.unknowns, *_axes(self.grid))
-        return np.asarray(pair.reference - gain * value - offset)
+        bands = self.warped_back(SplineImage.of(pair.deformed, order))
+        return np.asarray(pair.reference - np.vstack(list(bands)))
+
+    def warped_back(self, deformed: SplineImage) -> Iterator[FloatArray]:
+        """(1 + b) g(x + u) + c in the reference frame, some rows at a time; NaN off the image."""
+        grid, row, col = self.grid, np.arange(self.grid.rows)[:, None], np.arange(self.grid.cols)
+        for first in range(0, grid.rows, _BAND):
+            band = slice(first, first + _BAND)
+            u = self.ansatz.displacement(self.unknowns, grid.x, grid.y[band]) / grid.pixel_size
+            value, _, _ = deformed.sample(row[band] - u[..., 1], col + u[..., 0])
+            gain, offset = self.ansatz.gain_and_offset(self.unknowns, grid.x, grid.y[band])
+            yield gain * value + offset
 
     def write(self, path: Path | str) -> None:
         """Write JSON, atomically; every number comes back as it was."""

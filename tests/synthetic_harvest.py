@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, square_family
-from modeharvest.idic.photograph.geometry import Geometry, Part, Region, SpecimenTable
+from modeharvest.idic.photograph.geometry import Geometry, Region, SpecimenTable
 from modeharvest.idic.photograph.holes import find_hole_lattice
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
@@ -186,7 +186,7 @@ def harvest(
     region = Region(CELLULAR, DOMAIN, ())
     return Harvest(
         case=case,
-        geometry=Geometry(GRID, MASK, find_hole_lattice(MASK), region, (Part("", CELLULAR),)),
+        geometry=Geometry(GRID, MASK, find_hole_lattice(MASK), region, {"": CELLULAR}),
         reference=reference,
         frames=frames,
         noise=CameraNoise(NOISE, "measured from 3 exposures"),

@@ -207,5 +207,5 @@ def test_unknowns_without_information_are_named() -> None:
 
 
 def test_mask_of_another_size() -> None:
-    with pytest.raises(InputError, match="some material"):
+    with pytest.raises(InputError, match="like the images"):
         identifiability(noisy(), np.zeros((3, 3), dtype=bool))

@@ -287,19 +287,13 @@ def _quality(
     table: Table, chosen: dict[str, Column], n: int, scale: float, in_px: bool, where: str
 ) -> tuple[FloatArray | None, NDArray[np.bool_]]:
     """(n, 2) standard deviations [mm] or None, and (n,) which points the file marks as valid."""
-    values = {}
-    for role in ("sd_u", "sd_v", "sigma", "valid"):
-        if role in chosen:
-            values[role] = table[chosen[role].name].ravel()
-            if values[role].size != n:
-                raise InputError(
-                    f"{where}: expected {chosen[role].name} for {n} points, got {values[role].size}"
-                )
-    ok = np.ones(n, dtype=np.bool_)
-    if "valid" in values:
-        ok &= values["valid"] > 0
-    if "sigma" in values:
-        ok &= values["sigma"] >= 0
+    values = {role: table[c.name].ravel() for role, c in chosen.items() if role not in ROLES}
+    for role, given in values.items():
+        if given.size != n:
+            raise InputError(
+                f"{where}: expected {chosen[role].name} for {n} points, got {given.size}"
+            )
+    ok = (values.get("valid", np.ones(n)) > 0) & (values.get("sigma", np.zeros(n)) >= 0)
     sd = None
     if "sd_u" in values and "sd_v" in values:
         sd = scale * np.column_stack([values["sd_u"], values["sd_v"]])

@@ -71,13 +71,12 @@ def robust_fit(matrix: FloatArray, values: FloatArray) -> RobustFit:
 
 
 def fit_unknowns(
-    ansatz: Ansatz, a: ArrayLike, field: LocalField, v0_degree: int, v_degree: int
+    ansatz: Ansatz, a: ArrayLike, field: LocalField, v0_degree: int, v_degree: int = 0
 ) -> RobustFit:
     """Fit v0, and every v_i, to displacements at points; the modes are fixed.
 
     The unknowns ``a`` (size,) are those of the modes' parameters. Higher degrees than those given
-    are zero; a negative ``v_degree`` leaves every v_i as it is in ``a``. Raises InputError if there
-    are fewer components than coefficients.
+    are zero. Raises InputError if there are fewer components than coefficients.
     """
     a = ansatz.checked(a).copy()
     stride = max(1, -(-int(field.good.sum()) // MOST_POINTS))
@@ -146,7 +145,7 @@ def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
         return None
     degree = fitting[-1]
     slow = Ansatz(domain, (), degree, 0)
-    fit = fit_unknowns(slow, np.zeros(slow.size), holes, degree, -1)
+    fit = fit_unknowns(slow, np.zeros(slow.size), holes, degree)
     return partial(slow.displacement_at, fit.coefficients), (
         f"v0 starts from the motion of {count} hole centres: a polynomial of degree {degree} "
         f"leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} of {2 * count} components set aside."

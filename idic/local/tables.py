@@ -233,8 +233,8 @@ _BASES: dict[str, set[str]] = {
           "x displacement", "displacements u", "d x"},
     "sd_u": {"sd u", "sigma u", "std u", "u std", "u sd"},
 }  # fmt: skip
-_TURNED = {"y": "x", "v": "u", "sd_v": "sd_u"}
-_ALONE = {"sigma": "sigma", "valid": "valid"}
+_TURNED = {"x": "y", "u": "v", "sd_u": "sd_v"}
+_ALONE = ("sigma", "valid")
 _IMAGE_CODES = {"subset x", "ss x", "coordinate x", "subset coordinates x"}
 """Names of codes that always write pixels, y down: pyvale and DICe."""
 _UNITS = {"px": "px", "pixel": "px", "pixels": "px", "pix": "px", "mm": "mm"}
@@ -269,13 +269,11 @@ def column(name: str) -> Column:
 
 
 def _role(base: str) -> str | None:
-    for role, bases in _BASES.items():
-        if base in bases:
-            return role
-    for role, like in _TURNED.items():
-        if _as_x(base) in _BASES[like] and _as_x(base) != base:
-            return role
-    return _ALONE.get(base)
+    as_x = _as_x(base)
+    role = next((role for role, bases in _BASES.items() if as_x in bases), None)
+    if role is None:
+        return base if base in _ALONE else None
+    return role if as_x == base else _TURNED[role]
 
 
 def _as_x(base: str) -> str:

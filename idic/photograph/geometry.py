@@ -7,6 +7,7 @@ mask image; modes live there. The domain of v0 is the whole specimen as far as t
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -240,16 +241,6 @@ _OVERLAP = 0.5
 """Cells by which the boxes of two parts may overlap; so wide are the tapers of their modes."""
 
 
-@dataclass(frozen=True)
-class Part:
-    """Where modes live."""
-
-    name: str
-    """Of a part with a pattern of its own; "" for the whole cellular part."""
-    box: Box
-    """Around it [mm]."""
-
-
 @dataclass(frozen=True, eq=False)
 class Geometry:
     """The specimen as the reference shows it."""
@@ -260,8 +251,9 @@ class Geometry:
     lattice: HoleLattice | None
     """Of the holes; None where there is none and the region was given."""
     region: Region
-    parts: tuple[Part, ...]
-    """Of the cellular part, each with modes of its own; one by default."""
+    parts: Mapping[str, Box]
+    """Boxes around the parts with modes of their own, by name [mm]; by default the whole cellular
+    part, whose name is ""."""
 
     @property
     def lattice_mm(self) -> FloatArray | None:
@@ -291,13 +283,13 @@ def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: 
     except InputError:
         if not (table.polygon or table.cells or table.regions):
             raise
-    given = tuple(
-        Part(r.name, _polygon(r.polygon, mask, grid, f"specimen.regions {r.name!r}").cellular)
+    given = {
+        r.name: _polygon(r.polygon, mask, grid, f"specimen.regions {r.name!r}").cellular
         for r in table.regions
-    )
+    }
     _require_apart(given, table.cell_size)
     region = _cellular(table, lattice, mask, grid, base)
-    return Geometry(grid, mask, lattice, region, given or (Part("", region.cellular),))
+    return Geometry(grid, mask, lattice, region, given or {"": region.cellular})
 
 
 def _cellular(
@@ -330,16 +322,15 @@ def _polygon(polygon: Corners, mask: BoolArray, grid: PixelGrid, where: str) -> 
         raise InputError(f"{where}: {error}") from error
 
 
-def _require_apart(parts: tuple[Part, ...], cell_size: float) -> None:
+def _require_apart(parts: Mapping[str, Box], cell_size: float) -> None:
     """Raise InputError if two parts share more than their modes' tapers do."""
-    for one, other in combinations(parts, 2):
-        a, b = one.box, other.box
+    for (one, a), (other, b) in combinations(parts.items(), 2):
         shared = min(
             min(a.x_max, b.x_max) - max(a.x_min, b.x_min),
             min(a.y_max, b.y_max) - max(a.y_min, b.y_min),
         )
         if shared > _OVERLAP * cell_size:
             raise InputError(
-                f"specimen.regions: expected parts beside each other, got {one.name!r} and "
-                f"{other.name!r}, whose boxes overlap by {shared:.3g} mm; draw them apart"
+                f"specimen.regions: expected parts beside each other, got {one!r} and "
+                f"{other!r}, whose boxes overlap by {shared:.3g} mm; draw them apart"
             )

@@ -131,7 +131,7 @@ def initial_guess(
     text += [line for region in regions for line in region.text]
     fixed = not modes
     if fixed and cells.square:
-        modes = [(fixed_square(cells), boxes[0])]
+        modes = [(fixed_square(cells), box) for box in boxes]
         text.append(
             "The mode is fixed at the square pattern that the lattice of holes allows: without a "
             "pattern, its parameters aren't observable."
@@ -323,7 +323,7 @@ def _fitted(ansatz: Ansatz, local: LocalField, fixed: bool) -> RobustFit:
     if not fixed:
         return fit_unknowns(ansatz, a, local, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
     alone = replace(ansatz, modes=(), brightness=Brightness())
-    fit = fit_unknowns(alone, np.zeros(alone.size), local, slow, -1)
+    fit = fit_unknowns(alone, np.zeros(alone.size), local, slow)
     return replace(fit, coefficients=np.concatenate([fit.coefficients, a[alone.size :]]))
 
 
@@ -333,7 +333,6 @@ def chosen_modes(
     """The guess's ansatz and unknowns with the specified family, its modes fixed or not."""
     ansatz, unknowns, fixed = guess.ansatz, guess.unknowns, guess.fixed
     wants_square = how.family == "square" and geometry.lattice is not None
-    family: ModeFamily | None = None
     if (wants_square and "square" not in guess.family) or (fixed and how.fixed_mode is False):
         if geometry.lattice is None:
             raise InputError(
@@ -341,11 +340,12 @@ def chosen_modes(
                 "of holes are found, got false"
             )
         family = square_family("junction").moved(junction(geometry.lattice, geometry.grid))
+        families = [(family, box) for box in geometry.parts.values()]
+        v0 = unknowns[: 2 * ansatz.v0_space.size]
+        ansatz = replace(ansatz, modes=Ansatz.on(ansatz.domain, families, cell_size).modes)
+        unknowns = ansatz.initial_guess()
+        unknowns[: v0.size] = v0
         fixed = False
-    elif fixed and ansatz.modes and len(geometry.parts) > 1:
-        family = ansatz.modes[0].family
-    if family is not None:
-        ansatz, unknowns = _in_every_part(family, ansatz, unknowns, geometry, cell_size)
     if how.fixed_mode is True and not fixed:
         ansatz, unknowns = with_fixed_modes(ansatz, unknowns)
         fixed = True
@@ -383,19 +383,3 @@ def _waves(ansatz: Ansatz, unknowns: FloatArray) -> list[tuple[Taper, FloatArray
         for i, mode in enumerate(ansatz.modes)
         for wave in mode.family.waves(unknowns[ansatz.phi_slice(i)])
     ]
-
-
-def _in_every_part(
-    family: ModeFamily,
-    ansatz: Ansatz,
-    unknowns: FloatArray,
-    geometry: Geometry,
-    cell_size: float,
-) -> tuple[Ansatz, FloatArray]:
-    """One family in each part, with v0 as it was and every v_i where the paper starts it."""
-    families = [(family, part.box) for part in geometry.parts]
-    made = replace(ansatz, modes=Ansatz.on(ansatz.domain, families, cell_size).modes)
-    a = made.initial_guess()
-    slow = 2 * ansatz.v0_space.size
-    a[:slow] = unknowns[:slow]
-    return made, a

@@ -130,7 +130,7 @@ def measure(
         blocks = match_blocks(pair, expected_by(known, pair.grid))
         require_same_surface(blocks)
         matching += f" v0 starts from the photograph before. {blocks.text}"
-    boxes = [part.box for part in geometry.parts]
+    boxes = list(geometry.parts.values())
     guess = initial_guess(
         pair, cell_size, boxes, local=local, holes=holes, lattice=geometry.lattice_mm,
         domain=geometry.region.domain, options=how,
@@ -179,10 +179,10 @@ def _guess_text(guess: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tupl
         return guess.text
     read = {line for region in guess.regions for line in region.pattern.text}
     text = [line for line in guess.text if line not in read]
-    for part, region in zip(geometry.parts, guess.regions, strict=True):
-        own = [k + 1 for k, mode in enumerate(ansatz.modes) if mode.taper.cellular == part.box]
+    for (name, box), region in zip(geometry.parts.items(), guess.regions, strict=True):
+        own = [k + 1 for k, mode in enumerate(ansatz.modes) if mode.taper.cellular == box]
         modes = " and ".join(f"v{k} phi{k}" for k in own) or "no mode"
-        text.append(f"Region {part.name!r}, {modes}: {' '.join(region.pattern.text)}")
+        text.append(f"Region {name!r}, {modes}: {' '.join(region.pattern.text)}")
     return tuple(text)
 
 
@@ -195,10 +195,6 @@ def _moved_holes(result: Result, geometry: Geometry) -> LocalField | None:
     return LocalField(x, y, v0, source="v0 at the holes")
 
 
-_BAND = 64
-"""Rows at a time, so that little memory is needed."""
-
-
 def warped_back(
     deformed: NDArray[Any], result: Result, order: int = 5
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -207,17 +203,8 @@ def warped_back(
     (1 + b) g(x + u) + c [grey levels] with a result's displacement, and gain and offset if they
     were unknowns; and where x + u lies inside the image. The spline's order is 3 or 5.
     """
-    grid, ansatz, a = result.grid, result.ansatz, result.unknowns
     spline = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
-    image = np.empty(grid.shape, dtype=np.float32)
-    col = np.arange(grid.cols)
-    for first in range(0, grid.rows, _BAND):
-        band = slice(first, min(first + _BAND, grid.rows))
-        u = result.ansatz.displacement(a, grid.x, grid.y[band]) / grid.pixel_size
-        row = np.arange(band.start, band.stop)[:, None]
-        value, _, _ = spline.sample(row - u[..., 1], col + u[..., 0])
-        gain, offset = ansatz.gain_and_offset(a, grid.x, grid.y[band])
-        image[band] = gain * value + offset
+    image = np.vstack([np.float32(band) for band in result.warped_back(spline)])
     inside = np.isfinite(image)
     image[~inside] = 0.0
     return image, inside

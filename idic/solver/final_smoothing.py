@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from modeharvest.idic.solver.pyramid import eroded, locally_normalised
+from modeharvest.idic.solver.pyramid import eroded, locally_normalised, smoothed
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 
@@ -127,11 +127,11 @@ def smoothed_pair(pair: ImagePair, blur_px: float) -> ImagePair:
     """
     if blur_px == 0.0:
         return pair
-    f = locally_normalised(pair.reference, pair.mask, blur_px, AROUND)
-    g = locally_normalised(pair.deformed, pair.deformed_mask, blur_px, AROUND)
     contrast = contrast_after(pair.reference, pair.mask, blur_px)
-    f *= contrast
-    g *= contrast
+    f, g = (
+        contrast * locally_normalised(smoothed(image, mask, blur_px), blur_px, AROUND)
+        for image, mask in ((pair.reference, pair.mask), (pair.deformed, pair.deformed_mask))
+    )
     return pair.with_images(f, g)
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
@@ -165,7 +164,7 @@ def level_pair(
     f = pair.reference if is_finest else _smooth(pair.reference, f_weight, level)
     g = _smooth(pair.deformed, pair.deformed_mask, level)
     if normalised and level.blur > 0:
-        f, g = _locally_normalised(f, level.blur), _locally_normalised(g, level.blur)
+        f, g = locally_normalised(f, level.blur), locally_normalised(g, level.blur)
     inside = pair.masks[0]
     if is_finest:
         inside = eroded(inside, edge_px)
@@ -216,8 +215,12 @@ def _smooth(image: FloatImage, weight: BoolArray | None, level: Level) -> FloatI
     return mean
 
 
-def _locally_normalised(image: FloatImage, blur: float, around: float = _AROUND) -> FloatImage:
-    """The image less its local mean, over its local standard deviation."""
+def locally_normalised(image: FloatImage, blur: float, around: float = _AROUND) -> FloatImage:
+    """Give an image blurred by ``blur`` px a local mean of 0 and a local contrast of 1.
+
+    Where all speckles count alike, the model error weighs alike everywhere. ``around`` is how far
+    the local mean and contrast reach [blurs].
+    """
     around *= blur
     image = image - blurred(image, around)
     contrast = np.sqrt(blurred(image**2, around))
@@ -227,15 +230,3 @@ def _locally_normalised(image: FloatImage, blur: float, around: float = _AROUND)
 def smoothed(image: FloatImage, mask: BoolArray | None, blur: float) -> FloatImage:
     """Blur an image by ``blur`` px over its material, True in the mask, and continue it beyond."""
     return _smooth(np.asarray(image, np.float32), mask, Level(1, blur))
-
-
-def locally_normalised(
-    image: FloatImage, mask: BoolArray | None, blur: float, around: float = _AROUND
-) -> NDArray[np.float32]:
-    """Blur an image over its material, and give it a local mean of 0 and a local contrast of 1.
-
-    Where all speckles count alike, the model error weighs alike everywhere. What is outside the
-    mask has no part in it. The blur is in px, how far the local mean and contrast reach in blurs.
-    """
-    smooth = smoothed(image, mask, blur)
-    return np.asarray(_locally_normalised(smooth, blur, around), dtype=np.float32)

@@ -45,7 +45,7 @@ from modeharvest.idic.spectra.waves import GROWTH, select_waves
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_record, reading, write_json
-from modeharvest.util.typed import picked, to_plain
+from modeharvest.util.typed import to_plain
 
 
 def overlap(
@@ -214,25 +214,19 @@ def write_family(
     spectrum of the same field is kept beside it. Raises InputError if ``info`` can't be written as
     JSON, or the file can't be written.
     """
+    plain = to_plain(found)
     content: dict[str, Any] = {
         "format": FORMAT,
         "conventions": _CONVENTIONS,
-        **to_plain(found.family),
-        **picked(found, "pitch amplitude captured"),
-        "growth": [list(step) for step in found.growth],
-        "text": list(found.text),
+        **plain.pop("family"),
+        **plain,
         "waves": found.waves.tolist(),
         "info": {**found.info, **(info or {})},
     }
     if spectrum is not None:
         u = spectrum.coefficients  # as [[re, im] of u_x, [re, im] of u_y] for each wave vector
-        content["spectrum"] = {
-            **picked(spectrum, "pitch energy material"),
-            "lattice": spectrum.lattice.tolist(),
-            "translation": list(spectrum.translation),
-            "xi": spectrum.xi.tolist(),
-            "coefficients": np.stack([u.real, u.imag], axis=-1).tolist(),
-        }
+        pairs = np.stack([u.real, u.imag], axis=-1)
+        content["spectrum"] = to_plain(vars(spectrum) | {"coefficients": pairs})
     try:
         json.dumps(content, allow_nan=False)
     except (TypeError, ValueError) as error:

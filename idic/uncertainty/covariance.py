@@ -108,12 +108,9 @@ class MatchedImages:
     def of(cls, result: Result, pair: ImagePair, edge_px: int) -> MatchedImages:
         """Prepare the images of a result once more as the last level of its correlation did."""
         level = level_pair(pair, FULL, edge_px, result.order)
-        used = level.mask
-        if level.valid is not None:
-            every = Assembly(result.ansatz, result.grid, level.mask)
-            used, _ = valid_pixels(
-                every, result.unknowns, level.reference, level.deformed, level.valid
-            )
+        assert level.valid is not None  # on the finest level
+        every = Assembly(result.ansatz, result.grid, level.mask)
+        used, _ = valid_pixels(every, result.unknowns, level.reference, level.deformed, level.valid)
         row, col = np.indices(result.grid.shape, dtype=np.float64)
         deformed = level.deformed.sample(row, col)[0].astype(np.float32)
         return cls(result, level.reference, deformed, used)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.idic.result import Result
+from modeharvest.imaging.pair import checked_mask
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
 from modeharvest.util.scaled_eigen import ScaledEigen
 
 _POINTS = 4000  # at which displacements are compared
@@ -116,12 +116,8 @@ def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiab
 def _sensitivities(result: Result, mask: ArrayLike | None) -> tuple[FloatArray, list[FloatArray]]:
     """At some points of the material: (2 p, n) du/da, and for each mode (p, 2) v_i phi_i [mm]."""
     grid, a = result.grid, result.unknowns
-    inside = np.ones(grid.shape, np.bool_) if mask is None else np.asarray(mask, np.bool_)
-    if inside.shape != grid.shape or not inside.any():
-        raise InputError(
-            f"expected a mask of {grid.shape} px with some material, got shape {inside.shape} "
-            f"with {int(inside.sum())} px"
-        )
+    inside = checked_mask(mask, "mask", grid)
+    inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
     stride = max(1, int(np.sqrt(inside.sum() / _POINTS)))
     row, col = (index * stride for index in np.nonzero(inside[::stride, ::stride]))
     if not row.size:

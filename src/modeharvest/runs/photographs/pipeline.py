@@ -234,8 +234,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         along, across = mean_strain(result, box)
         spectrum = measured_spectrum(measured.local, cell, box)
         pattern = read_pattern(spectrum)
-        parts = geometry.parts if len(geometry.parts) > 1 else ()
-        own = {part.name: measured_spectrum(measured.local, cell, part.box) for part in parts}
+        parts = geometry.parts if len(geometry.parts) > 1 else {}
+        own = {n: measured_spectrum(measured.local, cell, box) for n, box in parts.items()}
         return HarvestedFrame(
             name=name,
             strain_x=along,
