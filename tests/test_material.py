@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from modeharvest.idic.photograph.material import MaterialOptions, find_material
+from modeharvest.idic.photograph.material import find_material
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.errors import InputError
 
@@ -122,5 +122,5 @@ def test_bad_images_are_refused() -> None:
         find_material(np.zeros((30, 100)))
     with pytest.raises(InputError, match="NaN"):
         find_material(np.full((100, 100), np.nan))
-    with pytest.raises(InputError, match="reach"):
-        MaterialOptions(window_px=11, reach_px=10.0)
+    with pytest.raises(InputError, match="window of 5 px or more"):
+        find_material(image(0.3, 0.01, specimen()), 4)

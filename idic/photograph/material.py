@@ -19,18 +19,6 @@ from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 
 
-def material_options(cell_px: float) -> MaterialOptions:
-    """How material is distinguished from background where cells are that large [px].
-
-    Buckled holes are narrow: the window has to fit into them.
-    """
-    window = int(np.clip(_WINDOW_SHARE * cell_px, 9, 25)) // 2 * 2 + 1
-    return MaterialOptions(window_px=window, reach_px=0.4 * window)
-
-
-_WINDOW_SHARE = 0.15
-
-
 def grown(mask: BoolArray, px: float) -> BoolArray:
     """The mask and all pixels within this distance of it [px].
 
@@ -68,6 +56,11 @@ def connected_to(seed: BoolArray, mask: BoolArray) -> BoolArray:
     return np.asarray(keep[parts])
 
 
+_WINDOW_SHARE, _WIDEST_PX = 0.15, 25
+"""Buckled holes are narrow: a share of a cell fits into them, and the widest window is enough."""
+_REACH = 0.4
+"""Radius that a hole is at least as round as [windows]. Where the background is as dark or as
+bright as some speckles, nothing but this keeps such speckles at its edge apart from it."""
 _SMOOTH_PX = 1.0
 """Blur that takes away most of a camera's noise and little of a speckle of 3 px."""
 _APART = 3.0
@@ -90,25 +83,6 @@ _SLIGHTEST = 0.02
 """Share of material with grey levels of the background from which on that is reported."""
 
 
-@dataclass(frozen=True)
-class MaterialOptions:
-    """How material is distinguished from background."""
-
-    window_px: int = 25
-    """Size of the square in which the speckle's contrast is looked at [px]: two to three speckles
-    across, and well below a hole's diameter."""
-    reach_px: float = 10.0
-    """Radius that a hole is at least as round as [px]. Where the background is as dark or as bright
-    as some speckles, nothing but this keeps such speckles at its edge apart from it."""
-
-    def __post_init__(self) -> None:
-        if self.window_px < 5 or not 1.0 <= self.reach_px <= 0.5 * self.window_px:
-            raise InputError(
-                "expected a window of 5 px or more and a reach from 1 px to half of it, got "
-                f"{self.window_px} and {self.reach_px} px"
-            )
-
-
 @dataclass(frozen=True, eq=False)
 class MaterialMask:
     """The material found in an image."""
@@ -118,15 +92,21 @@ class MaterialMask:
     text: tuple[str, ...]
 
 
-def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> MaterialMask:
+def window_for(cell_px: float) -> int:
+    """The window of :func:`find_material` where cells are that large [px]."""
+    return int(np.clip(_WINDOW_SHARE * cell_px, 9, _WIDEST_PX)) // 2 * 2 + 1
+
+
+def find_material(image: ArrayLike, window: int = _WIDEST_PX) -> MaterialMask:
     """Find the material in an image (rows, cols) of a speckled specimen, grey levels in any unit.
 
-    Raises InputError unless it is plane, finite, larger than the window, and shows a speckle.
+    ``window`` is the size of the square in which the speckle's contrast is looked at [px]: two to
+    three speckles across, and well below a hole's diameter. Raises InputError unless the image is
+    plane, finite, larger than the window, and shows a speckle.
     """
-    options = options or MaterialOptions()
-    grey = _checked(image, options)
-    contrast = _local_contrast(grey, options.window_px)
-    sure, ratio = _surely_background(contrast, options)
+    grey = _checked(image, window)
+    contrast = _local_contrast(grey, window)
+    sure, ratio = _surely_background(contrast, window)
     if not sure.any():
         if not contrast.max() > 0.0:
             raise InputError("expected a speckled material in the image, got a constant grey level")
@@ -137,22 +117,24 @@ def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> M
             "expected a speckled material in the image, got a mask with nothing in it: no part has "
             "more contrast than the rest; give the mask as an image"
         )
-    material, alike = _refined(grey, sure, options)
+    material, alike = _refined(grey, sure, window)
     if not material.any():
         raise InputError(
             "expected a speckled material in the image, got a mask with nothing in it: the "
             "background's grey levels are everywhere; give the mask as an image"
         )
-    material, walls = _without_walls(grey, material, options)
+    material, walls = _without_walls(grey, material, window)
     return MaterialMask(material, _text(material, ratio, alike, walls))
 
 
-def _checked(image: ArrayLike, options: MaterialOptions) -> FloatImage:
+def _checked(image: ArrayLike, window: int) -> FloatImage:
+    if window < 5:
+        raise InputError(f"expected a window of 5 px or more, got {window} px")
     grey = np.asarray(image, dtype=np.float32)
-    if grey.ndim != 2 or min(grey.shape) < 2 * options.window_px:
+    if grey.ndim != 2 or min(grey.shape) < 2 * window:
         raise InputError(
-            f"expected a plane image of at least {2 * options.window_px} px each way to look for "
-            f"material with a window of {options.window_px} px, got shape {grey.shape}"
+            f"expected a plane image of at least {2 * window} px each way to look for "
+            f"material with a window of {window} px, got shape {grey.shape}"
         )
     if not np.isfinite(grey).all():
         raise InputError("expected finite grey levels to find material, got NaN or infinity")
@@ -168,7 +150,7 @@ def _local_contrast(grey: FloatImage, window: int) -> FloatImage:
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float32)
 
 
-def _surely_background(contrast: FloatImage, options: MaterialOptions) -> tuple[BoolArray, float]:
+def _surely_background(contrast: FloatImage, window: int) -> tuple[BoolArray, float]:
     """Where there is surely no speckle, and how much more contrast there is elsewhere."""
     log = np.log(np.maximum(contrast, 1e-6 * max(float(contrast.max()), 1e-30)))
     dull = log < threshold_otsu(log[::4, ::4])  # type: ignore[no-untyped-call]
@@ -176,17 +158,15 @@ def _surely_background(contrast: FloatImage, options: MaterialOptions) -> tuple[
     if ratio < _APART:
         return np.zeros(contrast.shape, dtype=np.bool_), np.inf
     # Flat patches of a few joined speckles are dull, too, but not wide.
-    return opened(dull, 0.25 * options.window_px), ratio
+    return opened(dull, 0.25 * window), ratio
 
 
-def _refined(
-    grey: FloatImage, sure: BoolArray, options: MaterialOptions
-) -> tuple[BoolArray, float]:
+def _refined(grey: FloatImage, sure: BoolArray, window: int) -> tuple[BoolArray, float]:
     """(material, share of it that looks like background), from the background's own level."""
-    level, spread = _background_level(grey, sure, 4 * options.window_px)
+    level, spread = _background_level(grey, sure, 4 * window)
     away = np.abs(grey - level)
     tolerance = np.maximum(_SIGMAS * spread, _FAINTEST * float(np.ptp(grey)))
-    first = _background(away < tolerance, sure, options)
+    first = _background(away < tolerance, sure, _REACH * window)
     some = (slice(None, None, 2),) * 2  # every fourth pixel will do for statistics
     inside = shrunk(~first[some], 0.5 * _LENS_PX)
     if not inside.any():
@@ -194,38 +174,35 @@ def _refined(
     # Half-way to the material's nearest levels where they leave a gap, else as near as the
     # noise allows.
     half = 0.5 * float(np.quantile(away[some][inside], 0.01))
-    background = _background(away < np.maximum(tolerance, half), sure, options)
+    background = _background(away < np.maximum(tolerance, half), sure, _REACH * window)
     share = float((away < tolerance)[some][inside].mean())
-    return without_small(~background, options.window_px**2), share
+    return without_small(~background, window**2), share
 
 
-def _background(alike: BoolArray, sure: BoolArray, options: MaterialOptions) -> BoolArray:
+def _background(alike: BoolArray, sure: BoolArray, reach: float) -> BoolArray:
     """What has the background's grey level far and wide, or is connected to what surely is it."""
-    reach = options.reach_px
     wide = opened(~without_small(~alike, _SPECK_PX2), reach)
     return connected_to(sure, wide) | without_small(wide, int(_WIDE * np.pi * reach**2))
 
 
-def _without_walls(
-    grey: FloatImage, material: BoolArray, options: MaterialOptions
-) -> tuple[BoolArray, float]:
+def _without_walls(grey: FloatImage, material: BoolArray, window: int) -> tuple[BoolArray, float]:
     """The material without what lies deeper, out of focus: (material, share taken away).
 
     Through a hole in a thick specimen the camera sees the hole's wall, bright but blurred.
     """
-    window = max(5, int(_WALL_WINDOW * options.window_px))
+    narrow = max(5, int(_WALL_WINDOW * window))
     fine = gaussian_filter(grey, 0.7) - gaussian_filter(grey, 2.7)
-    power = uniform_filter(fine.astype(np.float64) ** 2, window)
+    power = uniform_filter(fine.astype(np.float64) ** 2, narrow)
     sharpness = np.sqrt(np.maximum(power, 0.0))
     some = (slice(None, None, 4),) * 2
-    core = shrunk(material[some], 0.25 * window)
+    core = shrunk(material[some], 0.25 * narrow)
     if not core.any():
         return material, 0.0
     dull = material & (sharpness < _WALL_SHARPNESS * float(np.median(sharpness[some][core])))
     background = ~material
-    wall = opened(dull, 0.25 * window) & connected_to(background, dull | background)
-    # Near the edge the window holds some sharp material: a wall ends a little further on.
-    rest = without_small(material & ~grown(wall, 0.45 * window), options.window_px**2)
+    wall = opened(dull, 0.25 * narrow) & connected_to(background, dull | background)
+    # Near the edge this window holds some sharp material: a wall ends a little further on.
+    rest = without_small(material & ~grown(wall, 0.45 * narrow), window**2)
     return rest, float((material & ~rest).sum() / material.sum())
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from modeharvest.idic.local.field import LocalField, read_field, without_distortion
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
-from modeharvest.idic.photograph.material import MaterialOptions, find_material, material_options
+from modeharvest.idic.photograph.material import find_material, window_for
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial, calibrate
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
@@ -245,13 +245,13 @@ def prepare(
     Raises InputError if the reference can't be used, or none of the deformed images.
     """
     images, table, base = case.images, case.specimen, case.base
-    options = material_options(table.cell_size / case.scale.mm_per_px)
+    window = window_for(table.cell_size / case.scale.mm_per_px)
 
     def save(
         name: str, photograph: Photograph, given: Path | None
     ) -> tuple[BoolArray, Sequence[str]]:
         """Write image and mask without distortion; returns the photograph's own :func:`_mask`."""
-        image, (mask, text) = photograph.image, _mask(photograph, given, options)
+        image, (mask, text) = photograph.image, _mask(photograph, given, window)
         own = mask
         if distortion is not None:
             image, mask = undistorted(image, distortion), undistorted_mask(mask, distortion)
@@ -294,11 +294,11 @@ def prepare(
 
 
 def _mask(
-    photograph: Photograph, given: Path | None, options: MaterialOptions
+    photograph: Photograph, given: Path | None, window: int
 ) -> tuple[BoolArray, Sequence[str]]:
     """Where a photograph shows material, as given or as found, and how it was found."""
     if given is None:
-        found = find_material(photograph.image, options)
+        found = find_material(photograph.image, window)
         return found.mask, found.text
     mask = read_mask(given)
     require_same_shape(photograph.image, mask, str(photograph.path), str(given))
