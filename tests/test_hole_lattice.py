@@ -25,9 +25,9 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-def holes_at(centres: FloatArray, area: float = 7000.0) -> Holes:
+def holes_at(centres: FloatArray, diameter: float = 94.0) -> Holes:
     n = len(centres)
-    return Holes(centres, np.full(n, area), too_small=0, at_border=1)
+    return Holes(centres, np.full(n, diameter), too_small=0, at_border=1)
 
 
 def lattice_points(vectors: FloatArray, counts: tuple[int, int]) -> FloatArray:

@@ -21,7 +21,7 @@ from scipy.ndimage import binary_fill_holes
 from skimage.registration import optical_flow_ilk
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.chebyshev import Box, orders
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.solver.pyramid import Level, LevelPair, level_pair
 from modeharvest.imaging.grid import PixelGrid
@@ -96,11 +96,9 @@ def fit_unknowns(
 
 def _low_orders(ansatz: Ansatz, v0_degree: int, v_degree: int) -> NDArray[np.intp]:
     """Where v0 and v_i up to these degrees are among the unknowns."""
-    low0 = [k for k, (i, j) in enumerate(ansatz.v0_space.orders) if i + j <= v0_degree]
-    low = [k for k, (i, j) in enumerate(ansatz.v_space.orders) if i + j <= v_degree]
-    places = [ansatz.v0_slice(c).start + k for c in (0, 1) for k in low0]
-    places += [ansatz.v_slice(m).start + k for m in range(len(ansatz.modes)) for k in low]
-    return np.array(places, dtype=np.intp)
+    v0, v = (np.arange(len(orders(degree))) for degree in (v0_degree, v_degree))
+    places = [ansatz.v0_slice(c).start + v0 for c in (0, 1)]
+    return np.concatenate(places + [ansatz.v_slice(m).start + v for m in range(len(ansatz.modes))])
 
 
 SLOW_DEGREE = 3

@@ -29,8 +29,8 @@ class Holes:
 
     centres: FloatArray
     """(n, 2) centroids, (row, col) [px]."""
-    areas: FloatArray
-    """(n,) [px^2]."""
+    diameters: FloatArray
+    """(n,) of circles with the holes' areas [px]."""
     too_small: int
     """Number of openings left out because the others are much larger."""
     at_border: int
@@ -38,11 +38,6 @@ class Holes:
 
     def __len__(self) -> int:
         return len(self.centres)
-
-    @property
-    def diameters(self) -> FloatArray:
-        """(n,) diameters of circles of the same area [px]."""
-        return np.asarray(2.0 * np.sqrt(self.areas / np.pi))
 
 
 def find_holes(mask: ArrayLike, smallest_px2: float | None = None) -> Holes:
@@ -70,7 +65,7 @@ def find_holes(mask: ArrayLike, smallest_px2: float | None = None) -> Holes:
     centres = np.array(center_of_mass(~material, parts, large), dtype=np.float64)
     return Holes(
         centres=centres.reshape(-1, 2),
-        areas=areas[large],
+        diameters=2.0 * np.sqrt(areas[large] / np.pi),
         too_small=int(inner.size - large.size),
         at_border=int(border.size),
     )
