@@ -144,29 +144,20 @@ class LatticeSpectrum:
     """(2,) mean over the material that was taken out [mm]."""
 
     @property
-    def S_xx(self) -> FloatArray:
-        """(n,) energy spectral density of u_x [mm⁶]."""
-        return self._squared[:, 0]
-
-    @property
-    def S_yy(self) -> FloatArray:
-        """(n,) energy spectral density of u_y [mm⁶]."""
-        return self._squared[:, 1]
-
-    @property
-    def _squared(self) -> FloatArray:
+    def density(self) -> FloatArray:
+        """(n, 2) energy spectral densities S_xx and S_yy [mm⁶]."""
         return np.asarray(self.coefficients.real**2 + self.coefficients.imag**2)
 
     @property
     def shares(self) -> FloatArray:
         """(n,) share of the energy at each wave vector [-]; over all of them, the sum is 1."""
         area = abs(float(np.linalg.det(self.lattice)))
-        return np.asarray((self.S_xx + self.S_yy) / (area * self.energy))
+        return np.asarray(self.density.sum(axis=1) / (area * self.energy))
 
     @property
     def peaks(self) -> tuple[LatticePeak, ...]:
         """Wave vectors that carry energy, one of each pair ± ξ, by density, largest first."""
-        density, shares = self.S_xx + self.S_yy, self.shares
+        density, shares = self.density.sum(axis=1), self.shares
         listed = np.flatnonzero(upward(self.xi) & (2.0 * shares >= LEAST_SHARE))
         order = listed[np.argsort(-density[listed], kind="stable")]
         return tuple(

@@ -57,14 +57,9 @@ class Spectrum:
     """(2,) width and height of the material's bounding box [mm]."""
 
     @property
-    def S_xx(self) -> FloatArray:
-        """(n, m) energy spectral density of u_x [mm⁶]."""
-        return _squared(self.u_hat[..., 0])
-
-    @property
-    def S_yy(self) -> FloatArray:
-        """(n, m) energy spectral density of u_y [mm⁶]."""
-        return _squared(self.u_hat[..., 1])
+    def density(self) -> FloatArray:
+        """(n, m, 2) energy spectral densities S_xx and S_yy [mm⁶]."""
+        return _squared(self.u_hat)
 
     @property
     def cell(self) -> float:
@@ -73,17 +68,21 @@ class Spectrum:
 
     def at(self, xi: ArrayLike) -> ComplexArray:
         """(2,) transform of u_x and u_y [mm³] at any wave vector (ξ1, ξ2) [1/l]."""
-        xi1, xi2 = np.asarray(xi, dtype=np.float64) / self.pitch
-        along_x = np.exp(-2j * np.pi * xi1 * self.x)
-        along_y = np.exp(-2j * np.pi * xi2 * self.y)
-        value: ComplexArray = self.cell * (along_x @ np.tensordot(along_y, self.source, (0, 0)))
-        return value
+        return self.cell * self.sum_over(self.source, xi).conj()
 
-    def window(self, xi_max: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """(ξ1, ξ2, S_xx, S_yy), both components of ξ within ± ``xi_max`` [1/l]."""
+    def sum_over(self, values: FloatArray, xi: ArrayLike) -> ComplexArray:
+        """(n,) sum over the bins of values (q, p, n) times exp(2πi ξ·x/l)."""
+        angle_x, angle_y = 2 * np.pi / self.pitch * np.asarray(xi, dtype=np.float64)
+        along_x, along_y = np.exp(1j * angle_x * self.x), np.exp(1j * angle_y * self.y)
+        # numpy would turn all values into complex ones.
+        up = np.stack([along_y.real, along_y.imag]) @ values.reshape(len(values), -1)
+        found: ComplexArray = along_x @ (up[0] + 1j * up[1]).reshape(values.shape[1:])
+        return found
+
+    def window(self, xi_max: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(ξ1, ξ2, density), both components of ξ within ± ``xi_max`` [1/l]."""
         cols, rows = np.abs(self.xi1) <= xi_max, np.abs(self.xi2) <= xi_max
-        part = self.u_hat[np.ix_(rows, cols)]
-        return self.xi1[cols], self.xi2[rows], _squared(part[..., 0]), _squared(part[..., 1])
+        return self.xi1[cols], self.xi2[rows], _squared(self.u_hat[np.ix_(rows, cols)])
 
 
 def spectral_density(

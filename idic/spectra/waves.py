@@ -89,8 +89,8 @@ class PlaneWave:
 
 def find_peaks(spectrum: Spectrum) -> list[Peak]:
     """All maxima of S_xx + S_yy outside the edges' lines, or clear ones on a line, by size."""
-    xi1, xi2, S_xx, S_yy = spectrum.window(1.0)
-    S = S_xx + S_yy
+    xi1, xi2, both = spectrum.window(1.0)
+    S = both.sum(axis=-1)
     lobes = [spectrum.pitch / size for size in spectrum.extent]
     on1, on2 = (
         np.abs(xi - np.round(xi)) < min(0.3, EDGE_LINE_WIDTHS * lobe)
@@ -184,13 +184,11 @@ def _amplitudes(
     # Products of sines and cosines are those of sums and differences of their wave vectors, and
     # at a wave vector a sum over all bins is two small products of matrices.
     tapered = taper[..., None] * spectrum.source
-    projected = np.array([_sum_over(spectrum, tapered, k) for k in xi])
+    projected = np.array([spectrum.sum_over(tapered, k) for k in xi])
     pairs = xi[:, None] - xi[None, :], xi[:, None] + xi[None, :]
     weight = (taper * spectrum.coverage)[..., None]
     minus, plus = (
-        np.array([_sum_over(spectrum, weight, k)[0] for k in of.reshape(-1, 2)]).reshape(
-            len(xi), -1
-        )
+        np.array([spectrum.sum_over(weight, k)[0] for k in of.reshape(-1, 2)]).reshape(len(xi), -1)
         for of in pairs
     )
     normal = 0.5 * np.block(
@@ -201,16 +199,6 @@ def _amplitudes(
     total = float(np.sum(tapered * spectrum.source))
     explained = float(np.sum(solution * right)) / total
     return solution[: len(xi)] + 1j * solution[len(xi) :], explained
-
-
-def _sum_over(spectrum: Spectrum, values: FloatArray, xi: FloatArray) -> ComplexArray:
-    """(n,) sum over the bins of values (q, p, n) times exp(2πi ξ·x/l)."""
-    angle_x, angle_y = 2 * np.pi / spectrum.pitch * xi
-    along_x, along_y = np.exp(1j * angle_x * spectrum.x), np.exp(1j * angle_y * spectrum.y)
-    # numpy would turn all values into complex ones.
-    up = np.stack([along_y.real, along_y.imag]) @ values.reshape(len(values), -1)
-    found: ComplexArray = along_x @ (up[0] + 1j * up[1]).reshape(values.shape[1:])
-    return found
 
 
 PEAK_SHARE = 0.02

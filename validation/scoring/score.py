@@ -279,7 +279,7 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
         spectrum = spectral_density(u, regular, mask, unit, bins_per_cell=10, padding=1)
     except InputError:
         return None
-    density = (spectrum.S_xx + spectrum.S_yy).ravel()
+    density = spectrum.density.sum(axis=-1).ravel()
     cell = (spectrum.xi1[1] - spectrum.xi1[0]) * (spectrum.xi2[1] - spectrum.xi2[0]) / unit**2
     area = mask.sum() * regular.pixel_size**2
     frequency = np.hypot(spectrum.xi1[None, :], spectrum.xi2[:, None]).ravel() / unit

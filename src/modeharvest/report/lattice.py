@@ -252,7 +252,7 @@ def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> ReportFigure:
 
 def _densities(found: FoundPattern, n: int) -> list[ReportFigure]:
     spectrum = found.spectrum
-    both = {"xx": spectrum.S_xx, "yy": spectrum.S_yy}
+    both = dict(zip(("xx", "yy"), spectrum.density.T, strict=True))
     largest = float(max(S.max() for S in both.values()))
     made = []
     for name, S in both.items():

@@ -144,12 +144,12 @@ def draw_density(spectrum: Spectrum, pattern: WavePattern, component: int, end: 
     beside the lines that the specimen's edges leave on the axes. If 0, the largest peak's.
     """
     drawn, axes = wave_plane(1.0, 0.5, (0.17, 0.165, 0.59, 0.70), 0.84)
-    xi1, xi2, *both = spectrum.window(1.0)
+    xi1, xi2, both = spectrum.window(1.0)
     if not end > 0 and pattern.largest is not None:
         end = pattern.largest.density
     scale = ColourScale(style.DENSITY, 0.0, end if end > 0 else 1.0, "mm⁶", "max")
     h1, h2 = 0.5 * (xi1[1] - xi1[0]), 0.5 * (xi2[1] - xi2[0])
-    axes.imshow(both[component], extent=(xi1[0] - h1, xi1[-1] + h1, xi2[0] - h2, xi2[-1] + h2),
+    axes.imshow(both[..., component], extent=(xi1[0] - h1, xi1[-1] + h1, xi2[0] - h2, xi2[-1] + h2),
                 origin="lower", cmap=scale.colours, norm=scale.normalise, interpolation="bilinear",
                 aspect="auto", rasterized=True)  # fmt: skip
     axes.set(xlim=(-1, 1), ylim=(-1, 1))
