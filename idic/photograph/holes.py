@@ -318,8 +318,7 @@ def _missing(index: IntArray) -> IntArray:
     size = np.ptp(index, axis=0) + 1
     every = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), axis=-1).reshape(-1, 2)
     inside = every[Delaunay(index).find_simplex(every) >= 0]
-    present = {(int(i), int(j)) for i, j in index}
-    return np.array([(i, j) for i, j in inside if (int(i), int(j)) not in present]).reshape(-1, 2)
+    return np.asarray(inside[~(inside[:, None] == index).all(axis=-1).any(axis=1)])
 
 
 def _kind(vectors: FloatArray) -> Kind:

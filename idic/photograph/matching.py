@@ -118,17 +118,11 @@ def _motion(
     reference: HoleLattice, deformed: HoleLattice, index: IntArray, rivals: int
 ) -> HoleMotion:
     """The holes matched where the deformed ones have these indices in the reference's lattice."""
-    place = {(int(i), int(j)): k for k, (i, j) in enumerate(index)}
-    pairs = [
-        (n, place[key])
-        for n, (i, j) in enumerate(reference.index)
-        if (key := (int(i), int(j))) in place
-    ]
-    first, second = np.array(pairs).T
+    first, second = np.nonzero((reference.index[:, None] == index).all(axis=-1))
     before, after = reference.centres[first], deformed.centres[second]
     moved = np.linalg.norm(after - before, axis=1)
     text = [
-        f"{len(pairs)} holes were found in both images, of {len(reference)} in the reference and "
+        f"{len(first)} holes were found in both images, of {len(reference)} in the reference and "
         f"{len(deformed)} in the deformed one; they moved by {moved.min():.0f} to "
         f"{moved.max():.0f} px."
     ]

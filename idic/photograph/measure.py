@@ -137,23 +137,16 @@ def measure(
     )  # fmt: skip
     ansatz, unknowns, fixed = chosen_modes(guess, geometry, cell_size, how)
     text = (matching, *_guess_text(guess, ansatz, geometry))
-    options = how.options()
+    options, found = how.options(), None
     if before is not None and _goes_on(before, ansatz, unknowns, fixed):
         again, there = _with_brightness(before.result, how)
         found = correlate(pair, again, guess=there, options=options, progress=progress)
-        if found.outcome is Outcome.CONVERGED:
-            text = (*text, "The correlation started from the result of the photograph before.")
-            return _measured(found, guess.local, before.fixed, text)
-    found = correlate(pair, ansatz, guess=unknowns, options=options, progress=progress)
-    return _measured(found, guess.local, fixed, text)
-
-
-def _measured(
-    result: Result, local: LocalField, fixed: bool, text: tuple[str, ...]
-) -> MeasuredPhotograph:
-    """A photograph's result with the final smoothing in its text."""
-    assert result.final_smoothing is not None
-    return MeasuredPhotograph(result, local, fixed, (*text, result.final_smoothing.text))
+    if found is not None and found.outcome is Outcome.CONVERGED:
+        text = (*text, "The correlation started from the result of the photograph before.")
+    else:
+        found = correlate(pair, ansatz, guess=unknowns, options=options, progress=progress)
+    assert found.final_smoothing is not None  # as asked for by how.options()
+    return MeasuredPhotograph(found, guess.local, fixed, (*text, found.final_smoothing.text))
 
 
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:

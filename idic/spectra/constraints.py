@@ -147,7 +147,7 @@ def fixed_tie(ties: list[Tie]) -> Tie:
     return max(ties, key=lambda tie: tie.value)
 
 
-def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float) -> ModeFamily:
+def tied_family(waves: list[RealWave], ties: list[Tie], pitch: float) -> ModeFamily:
     """Make the family: amplitudes first, then wave vectors, then phases; ``pitch`` is l [mm]."""
     unit, fixed = np.eye(PER_WAVE * len(waves)), fixed_tie(ties)
     free = [tie for tie in ties if tie is not fixed and tie.value > 0]
@@ -163,7 +163,7 @@ def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float)
     for w, wave in enumerate(waves):
         parameters.append((unit[PER_WAVE * w + 4], wave.phase * pitch, f"c{w + 1}", "mm"))
     columns, start, names, units = zip(*parameters, strict=True)
-    offset = _amplitude_column(fixed, waves)
+    name, offset = f"{len(waves)} wave{'s' * (len(waves) != 1)}", _amplitude_column(fixed, waves)
     return ModeFamily(name, np.stack(columns, axis=1), offset, np.array(start), names, units)
 
 
@@ -174,11 +174,6 @@ def _amplitude_column(tie: Tie, waves: list[RealWave]) -> FloatArray:
         sign = np.sign(waves[w].amplitude[tie.component])
         column[w, :2] = sign * waves[w].frame[tie.component]
     return column.ravel()
-
-
-def as_rows(waves: list[RealWave], pitch: float) -> FloatArray:
-    """(w, 5) A, B [unit of the field], kx, ky [-], c [mm], nothing tied."""
-    return np.array([wave.row for wave in waves]) * [1.0, 1.0, 1.0, 1.0, pitch]
 
 
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")

@@ -28,7 +28,6 @@ from modeharvest.fem.field import Mesh
 from modeharvest.idic.modes import ModeFamily, free_family
 from modeharvest.idic.spectra.constraints import (
     SAME_AMPLITUDE,
-    as_rows,
     describe,
     find_ties,
     real_waves,
@@ -158,11 +157,10 @@ def mode_family(
     selection = select_waves(spectrum, rule, u, growth)
     waves = real_waves(selection)
     ties = find_ties(waves)
-    count = f"{len(waves)} wave" + "s" * (len(waves) > 1)
-    rows = as_rows(waves, pitch)
+    rows = np.array([wave.row for wave in waves]) * [1.0, 1.0, 1.0, 1.0, pitch]
     rows[:, :2] /= np.abs(rows[:, :2]).max()
     if shared:
-        family = as_square(rows, pitch) or tied_family(count, waves, ties, pitch)
+        family = as_square(rows, pitch) or tied_family(waves, ties, pitch)
     else:
         family = free_family(rows)
     phi = wave_values(rule, family.waves(family.start), pitch)
