@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +39,7 @@ from modeharvest.idic.photograph.holes import find_holes
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.spectra.pattern import WavePattern, nearest_origin, read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum
-from modeharvest.idic.spectra.waves import PlaneWave
+from modeharvest.idic.spectra.waves import PlaneWave, grouped
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -283,25 +284,15 @@ def modes_of(pattern: WavePattern, cells: Cells) -> list[ModeFamily]:
     """
     if pattern.start is not None:
         return [replace(nearest_origin(pattern.start, cells.cell_size), name="square")]
-    groups: list[list[PlaneWave]] = []
-    for wave in pattern.waves:
-        group = next((g for g in groups if _coupled(g[0], wave, cells)), None)
-        if group is None:
-            groups.append([wave])
-        else:
-            group.append(wave)
-    return [_free_mode(group) for group in groups]
+    return [_free_mode(group) for group in grouped(pattern.waves, partial(_coupled, cells))]
 
 
-def _coupled(one: PlaneWave, other: PlaneWave, cells: Cells) -> bool:
+def _coupled(cells: Cells, one: PlaneWave, other: PlaneWave) -> bool:
     """Whether two wave vectors, or one and the other's opposite, differ by a reciprocal vector."""
-    for sign in (1.0, -1.0):
-        apart = (np.array(other.xi) - sign * np.array(one.xi)) / cells.cell_size
-        periods = cells.vectors @ apart
-        rest = np.linalg.solve(cells.vectors, periods - np.round(periods)) * cells.cell_size
-        if np.linalg.norm(rest) <= SAME_WAVE:
-            return True
-    return False
+    apart = np.array(other.xi) - np.outer((1.0, -1.0), one.xi)
+    periods = cells.vectors @ apart.T / cells.cell_size
+    rest = np.linalg.solve(cells.vectors, periods - np.round(periods)) * cells.cell_size
+    return bool((np.linalg.norm(rest, axis=0) <= SAME_WAVE).any())
 
 
 def _free_mode(waves: list[PlaneWave]) -> ModeFamily:

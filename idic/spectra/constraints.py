@@ -23,7 +23,7 @@ import numpy as np
 
 from modeharvest.idic.modes import PER_WAVE, ModeFamily, local_frame
 from modeharvest.idic.spectra.pattern import SAME_PHASE
-from modeharvest.idic.spectra.waves import Selection, common_phase
+from modeharvest.idic.spectra.waves import Selection, common_phase, grouped
 from modeharvest.util.arrays import FloatArray
 
 SAME_AMPLITUDE = 0.02
@@ -134,11 +134,9 @@ def find_ties(waves: list[RealWave]) -> list[Tie]:
 def _clustered(component: int, sizes: dict[int, float], tolerance: float) -> list[Tie]:
     zero = tuple(k for k, size in sizes.items() if size <= tolerance)
     ties = [Tie(component, zero, 0.0)] if zero else []
-    rest = {k: size for k, size in sizes.items() if size > tolerance}
-    while rest:
-        first = next(iter(rest.values()))
-        same = tuple(k for k, size in rest.items() if abs(size - first) <= tolerance)
-        ties.append(Tie(component, same, float(np.mean([rest.pop(k) for k in same]))))
+    rest = [k for k, size in sizes.items() if size > tolerance]
+    for same in grouped(rest, lambda one, other: abs(sizes[other] - sizes[one]) <= tolerance):
+        ties.append(Tie(component, tuple(same), float(np.mean([sizes[k] for k in same]))))
     return ties
 
 

@@ -26,8 +26,9 @@ Krishnaprasad, 1993, doi 10.1109/ACSSC.1993.342465).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -38,6 +39,7 @@ from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.util.arrays import ComplexArray, FloatArray
 from modeharvest.util.errors import InputError
 
+T = TypeVar("T")
 EDGE_LINE_WIDTHS = 2.0
 """Distance from whole numbers of ξ [l/L] within which a maximum is taken for an edge line."""
 LINE_CONTRAST = 10.0
@@ -299,19 +301,24 @@ def select_waves(
 
 def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
     """Peaks worth considering, those that symmetry may exchange together, from right to left."""
-    stars: list[list[LatticePeak]] = []
-    for peak in spectrum.peaks:
-        if peak.density < PEAK_SHARE * spectrum.peaks[0].density:
-            break
-        own = next((star for star in stars if _exchangeable(star[0], peak)), None)
-        if own is None:
-            stars.append([peak])
-        else:
-            own.append(peak)
+    peaks = spectrum.peaks
+    considered = [peak for peak in peaks if peak.density >= PEAK_SHARE * peaks[0].density]
     return [
         sorted((peak.xi for peak in star), key=lambda xi: np.arctan2(xi[1], xi[0]))
-        for star in stars
+        for star in grouped(considered, _exchangeable)
     ]
+
+
+def grouped(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:
+    """Each item with the first earlier one that it is like, if any has begun a group."""
+    groups: list[list[T]] = []
+    for item in items:
+        own = next((group for group in groups if alike(group[0], item)), None)
+        if own is None:
+            groups.append([item])
+        else:
+            own.append(item)
+    return groups
 
 
 def _exchangeable(first: LatticePeak, other: LatticePeak) -> bool:
