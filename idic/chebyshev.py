@@ -56,11 +56,6 @@ class Box:
         """Make the box of this size [mm] around the origin."""
         return cls(-0.5 * width, 0.5 * width, -0.5 * height, 0.5 * height)
 
-    @classmethod
-    def around(cls, x: ArrayLike, y: ArrayLike) -> Box:
-        """Make the smallest box around positions [mm]."""
-        return cls(float(np.min(x)), float(np.max(x)), float(np.min(y)), float(np.max(y)))
-
     def contains(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """(...) True for positions (...) [mm] inside, or on the border."""
         inside = (x >= self.x_min) & (x <= self.x_max) & (y >= self.y_min) & (y <= self.y_max)

@@ -108,11 +108,6 @@ class LocalField:
             return float("inf")
         return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
 
-    @property
-    def box(self) -> Box:
-        """The smallest box around the valid points [mm]."""
-        return Box.around(self.x[self.good], self.y[self.good])
-
     def valid_points(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(m,) x, (m,) y and (m, 2) u of the valid points [mm]."""
         return self.x[self.good], self.y[self.good], self.u[self.good]
@@ -124,10 +119,11 @@ class LocalField:
     def selected(self, keep: BoolArray, what: str = "the selection") -> LocalField:
         """The points that ``keep`` (n,) names; raises InputError if none of them is valid."""
         if not (keep & self.good).any():
+            x, y, _ = self.valid_points()
             raise InputError(
                 f"local field{self._named}: expected valid points in {what}, got none; the field "
-                f"covers x = {self.box.x_min:.2f} to {self.box.x_max:.2f} and "
-                f"y = {self.box.y_min:.2f} to {self.box.y_max:.2f} mm"
+                f"covers x = {x.min():.2f} to {x.max():.2f} and y = {y.min():.2f} to {y.max():.2f} "
+                "mm"
             )
         sd = None if self.sd is None else self.sd[keep]
         return LocalField(

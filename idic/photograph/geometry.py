@@ -217,7 +217,8 @@ def _largest_part(mask: BoolArray) -> BoolArray:
 
 def _box(low: FloatArray, high: FloatArray, grid: PixelGrid) -> Box:
     """The box [mm] between two (row, col) [px]."""
-    return Box.around(*grid.to_mm([low[0], high[0]], [low[1], high[1]]))
+    (left, right), (top, bottom) = grid.to_mm([low[0], high[0]], [low[1], high[1]])
+    return Box(float(left), float(right), float(bottom), float(top))
 
 
 def _require_material(inside: BoolArray, mask: BoolArray, what: str) -> None:

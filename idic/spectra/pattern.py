@@ -154,24 +154,31 @@ class WavePattern:
     """Those of the pattern, from right to left by direction; empty if there is none."""
     largest: Peak | None
     """The largest peak outside the edges' lines, pattern or not; None if there is no maximum."""
-    family: str
-    """One of "square, 7 parameters", if Eq. (mode) of the paper describes it: two waves near the
-    diagonals, equal amplitudes in x and in y, the same sign in x and the opposite in y (or the
-    reverse); else "unknown", or "none" without waves."""
-    start: tuple[float, ...] | None
+    text: tuple[str, ...]
+    start: tuple[float, ...] | None = None
     """(7,) start for the mode [-, and mm for a₆, a₇], equivalents resolved; None if the family is
     not the square one."""
-    start_amplitude: float
+    start_amplitude: float = 0.0
     """Amplitude to start v₁φ₁ with: mean amplitude of the waves' y components, with the sign that
     belongs to ``start`` [mm]."""
-    text: tuple[str, ...]
+
+    @property
+    def family(self) -> str:
+        """ "square, 7 parameters" if Eq. (mode) describes it, else "unknown"; "none" without waves.
+
+        Two waves near the diagonals, equal amplitudes in x and in y, the same sign in x and the
+        opposite in y (or the reverse).
+        """
+        if self.start is not None:
+            return SQUARE
+        return "unknown" if self.waves else "none"
 
 
 def read_pattern(spectrum: Spectrum) -> WavePattern:
     """Find the waves of a long-range correlated pattern and check whether Eq. (mode) fits them."""
     peaks = find_peaks(spectrum)
     if not peaks:
-        return _no_pattern(None, "No pattern: no maximum outside the lines of the edges.")
+        return WavePattern((), None, ("No pattern: no maximum outside the lines of the edges.",))
     largest = peaks[0]
     chosen = [p for p in peaks if p.density >= SECONDARY_PEAK * largest.density]
     waves = fit_waves(spectrum, _pursued(spectrum, chosen[:MOST_PEAKS]))
@@ -179,14 +186,14 @@ def read_pattern(spectrum: Spectrum) -> WavePattern:
     share = explained_share(spectrum, waves)
     hidden = largest.contrast < SMALLEST_CONTRAST and share < LARGE_SHARE
     if strength < SMALLEST_AMPLITUDE * spectrum.pitch or hidden:
-        return _no_pattern(
-            largest,
+        why = (
             f"No pattern: the largest peak is at ξ = ({largest.xi[0]:+.2f}, {largest.xi[1]:+.2f}), "
             f"{largest.contrast:.0f} times the median density, with a mean amplitude of "
             f"{1e3 * strength:.1f} µm and {100 * share:.0f} % of the field (a pattern has "
             f"at least {1e3 * SMALLEST_AMPLITUDE * spectrum.pitch:.1f} µm, and "
-            f"{SMALLEST_CONTRAST:.0f} times or {100 * LARGE_SHARE:.0f} %).",
+            f"{SMALLEST_CONTRAST:.0f} times or {100 * LARGE_SHARE:.0f} %)."
         )
+        return WavePattern((), largest, (why,))
     waves.sort(key=lambda w: np.arctan2(w.k[1], w.k[0]))
     return _described(tuple(waves), largest, spectrum.pitch)
 
@@ -204,10 +211,6 @@ def _pursued(spectrum: Spectrum, peaks: list[Peak]) -> list[Peak]:
     return chosen
 
 
-def _no_pattern(largest: Peak | None, why: str) -> WavePattern:
-    return WavePattern((), largest, "none", None, 0.0, (why,))
-
-
 def _described(waves: tuple[PlaneWave, ...], largest: Peak, pitch: float) -> WavePattern:
     """Check the observations behind Eq. (mode), one line each."""
     vectors = " and ".join(f"[{w.k[0]:+.3f}, {w.k[1]:+.3f}]" for w in waves)
@@ -215,19 +218,17 @@ def _described(waves: tuple[PlaneWave, ...], largest: Peak, pitch: float) -> Wav
     text = [f"{count}, {vectors} π/l; the largest peak is {largest.contrast:.0f} times the median."]
     if len(waves) != 2:
         text.append("Eq. (mode) is not supported: it has two waves.")
-        return WavePattern(waves, largest, "unknown", None, 0.0, tuple(text))
+        return WavePattern(waves, largest, tuple(text))
     checks = (_directions(waves), _equality(waves), _signs(waves, pitch), _standing(waves))
     text += [line for _, line in checks]
     if not all(passed for passed, _ in checks):
         text.append("Eq. (mode) is not supported by these observations.")
-        return WavePattern(waves, largest, "unknown", None, 0.0, tuple(text))
+        return WavePattern(waves, largest, tuple(text))
     mode, v1 = square_parameters(np.array([w.row for w in waves]), pitch)
     start, sign = mode_equivalent(mode, pitch)
     numbers = ", ".join(f"{value:.2f}" for value in np.round(start, 2) + 0.0)
     text.append(f"Eq. (mode) is supported: {SQUARE}, start [{numbers}].")
-    return WavePattern(
-        waves, largest, SQUARE, tuple(float(v) for v in start), sign * v1, tuple(text)
-    )
+    return WavePattern(waves, largest, tuple(text), tuple(float(v) for v in start), sign * v1)
 
 
 def _directions(waves: tuple[PlaneWave, ...]) -> tuple[bool, str]:

@@ -41,7 +41,7 @@ MOST_SHOWN = 6
 """Photographs with pictures of their own, at most; numbers are given of all."""
 CLOSE = 3
 """Cells along the side of a closer look."""
-_NO_PATTERN = WavePattern((), None, "none", None, 0.0, ())
+_NO_PATTERN = WavePattern((), None, ())
 _SPECK = 0.01  # l²: holes and islands smaller than that are not drawn
 _LEVELS = (0.5, 99.5)  # percentiles of the reference's grey levels, drawn black and white
 _REACH = 0.75  # spacings of a local DIC from a point, within which a cell has its value
