@@ -77,7 +77,7 @@ def test_without_a_pattern_the_mode_is_held(images: ImageSet) -> None:
     """Before buckling, at 7.8 %: the lattice's own pattern, its origin on a junction, held."""
     start = start_of(images, 0.078)
     assert start.fixed
-    assert start.regions[0].pattern.family == "none"
+    assert start.patterns[0].family == "none"
     assert start.ansatz.modes[0].family.size == 0
     assert any("fixed at the square pattern" in s for s in start.text)
     x, y = np.linspace(-5, 5, 31), np.linspace(-9, 9, 41)
@@ -96,7 +96,7 @@ def test_a_local_field_is_taken_at_its_word(images: ImageSet) -> None:
     truth, mask = images.truth(0.128).displacement, images.mask()
     local = sampled_field(truth, images.grid, mask, 4)
     start = start_of(images, 0.128, local=local)
-    assert start.regions[0].pattern.start is not None
+    assert start.patterns[0].start is not None
     off = (start.ansatz.displacement(start.unknowns, images.grid.x, images.grid.y) - truth)[mask]
     # What the ansatz can't say is 0.5 px here; the start has lower degrees, besides.
     assert np.sqrt(np.mean(off**2)) / PIXEL < 1.0
@@ -216,8 +216,8 @@ def test_two_halves_with_patterns_of_their_own_get_modes_of_their_own() -> None:
     u = u + np.where(above, 0.0, [0.1 * PITCH * -1.0, 0.0])
     boxes = [Box(-5.7, 5.7, 0.0, 7.6), Box(-5.7, 5.7, -7.6, 0.0)]
     start = from_field(sampled_field(u, GRID, mask, 2), boxes)
-    assert [len(r.modes) for r in start.regions] == [1, 1]
-    assert all(r.pattern.start is not None for r in start.regions)
+    assert [mode.taper.cellular for mode in start.ansatz.modes] == boxes
+    assert all(pattern.start is not None for pattern in start.patterns)
     for box, shift, amplitude in zip(boxes, ((0, 0), (PITCH, 0)), (0.15, 0.1), strict=True):
         low, high = (box.x_min + 1, box.y_min + 1.5), (box.x_max - 1, box.y_max - 1.5)
         points = np.random.default_rng(2).uniform(low, high, (300, 2))

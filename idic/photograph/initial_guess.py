@@ -53,34 +53,14 @@ AMPLITUDE_DEGREE = 2
 
 
 @dataclass(frozen=True, eq=False)
-class RegionPattern:
-    """The pattern of a part of the specimen, and the modes made of it."""
-
-    pattern: WavePattern
-    """What the spectrum of the field there shows."""
-    modes: tuple[ModeFamily, ...]
-    """Each starts as the pattern; in the ansatz those of all regions follow one another."""
-
-    @property
-    def text(self) -> tuple[str, ...]:
-        """What was found."""
-        if len(self.modes) < 2:
-            return self.pattern.text
-        return (
-            *self.pattern.text,
-            f"The waves share no vector of the reciprocal lattice: {len(self.modes)} modes, each "
-            "with an amplitude of its own.",
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class InitialGuess:
     """Where a correlation begins, and how that was found."""
 
     ansatz: Ansatz
     unknowns: FloatArray
     """(size,) for :func:`modeharvest.idic.correlate.correlate`."""
-    regions: tuple[RegionPattern, ...]
+    patterns: tuple[WavePattern, ...]
+    """What the spectra of the field show, part by part; the modes follow one another likewise."""
     local: LocalField
     fixed: bool
     """Whether the modes are fixed because no pattern is observable."""
@@ -127,9 +107,19 @@ def initial_guess(
     else:
         share = 100 * local.valid_share
         text = [f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid."]
-    regions = tuple(_region_pattern(local, box, cells) for box in boxes)
-    modes = [(m, box) for box, part in zip(boxes, regions, strict=True) for m in part.modes]
-    text += [line for region in regions for line in region.text]
+    patterns = tuple(read_pattern(measured_spectrum(local, cell_size, box)) for box in boxes)
+    modes: list[tuple[ModeFamily, Box]] = []
+    for box, pattern in zip(boxes, patterns, strict=True):
+        if lattice is None:
+            require_cell_size(pattern, cell_size)
+        families = modes_of(pattern, cells)
+        modes += [(family, box) for family in families]
+        text += pattern.text
+        if len(families) > 1:
+            text.append(
+                f"The waves share no vector of the reciprocal lattice: {len(families)} modes, each "
+                "with an amplitude of its own."
+            )
     fixed = not modes
     if fixed and cells.square:
         modes = [(fixed_square(cells), box) for box in boxes]
@@ -146,7 +136,7 @@ def initial_guess(
         f"{fitted} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
         "aside."
     )
-    return InitialGuess(ansatz, fit.coefficients, regions, local, fixed, tuple(text))
+    return InitialGuess(ansatz, fit.coefficients, patterns, local, fixed, tuple(text))
 
 
 NEARLY_SQUARE = 0.05
@@ -167,9 +157,7 @@ class Cells:
     cell_size: float
     """l, the distance of neighbouring holes [mm]."""
     vectors: FloatArray
-    """(2, 2) lattice vectors as rows [mm]."""
-    given: bool
-    """Whether they were given, or are square for want of better knowledge."""
+    """(2, 2) lattice vectors as rows [mm]; square where they aren't known."""
     junction: FloatArray
     """(2,) the middle of the solid between four holes [mm]."""
 
@@ -197,7 +185,7 @@ class Cells:
         corner = np.array([boxes[0].x_min, boxes[0].y_min])
         hole = _middle_hole(centres, vectors) if len(centres) else corner + vectors.sum(axis=0) / 2
         junction = np.asarray(hole - 0.5 * vectors.sum(axis=0))
-        return cls(cell_size, vectors, lattice is not None, junction)
+        return cls(cell_size, vectors, junction)
 
     @property
     def square(self) -> bool:
@@ -247,14 +235,6 @@ def _matching_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray
         vectors = vectors[::-1]
     signs = np.where(np.diag(vectors) < 0, -1.0, 1.0)
     return np.asarray(vectors * signs[:, None])
-
-
-def _region_pattern(local: LocalField, box: Box, cells: Cells) -> RegionPattern:
-    """Find the pattern of one region in the field's spectrum there, and make its modes."""
-    pattern = read_pattern(measured_spectrum(local, cells.cell_size, box))
-    if not cells.given:
-        require_cell_size(pattern, cells.cell_size)
-    return RegionPattern(pattern, tuple(modes_of(pattern, cells)))
 
 
 def require_cell_size(pattern: WavePattern, cell_size: float) -> None:

@@ -170,12 +170,12 @@ def _guess_text(guess: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tupl
     """The initial guess's text; lines about a spectrum name its part, where there are several."""
     if len(geometry.parts) == 1:
         return guess.text
-    read = {line for region in guess.regions for line in region.pattern.text}
+    read = {line for pattern in guess.patterns for line in pattern.text}
     text = [line for line in guess.text if line not in read]
-    for (name, box), region in zip(geometry.parts.items(), guess.regions, strict=True):
+    for (name, box), pattern in zip(geometry.parts.items(), guess.patterns, strict=True):
         own = [k + 1 for k, mode in enumerate(ansatz.modes) if mode.taper.cellular == box]
         modes = " and ".join(f"v{k} phi{k}" for k in own) or "no mode"
-        text.append(f"Region {name!r}, {modes}: {' '.join(region.pattern.text)}")
+        text.append(f"Region {name!r}, {modes}: {' '.join(pattern.text)}")
     return tuple(text)
 
 

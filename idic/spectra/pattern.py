@@ -164,10 +164,10 @@ class WavePattern:
 
     @property
     def family(self) -> str:
-        """ "square, 7 parameters" if Eq. (mode) describes it, else "unknown"; "none" without waves.
+        """Either "square, 7 parameters", if Eq. (mode) describes it, "unknown", or "none".
 
-        Two waves near the diagonals, equal amplitudes in x and in y, the same sign in x and the
-        opposite in y (or the reverse).
+        Of the square one are two waves near the diagonals, of equal amplitudes in x and in y, and
+        with the same sign in x and the opposite in y (or the reverse).
         """
         if self.start is not None:
             return SQUARE
