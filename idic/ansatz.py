@@ -175,6 +175,11 @@ class Ansatz:
         """Number of unknowns."""
         return self.phi_offset(len(self.modes)) + self.brightness.size
 
+    @property
+    def fixed(self) -> bool:
+        """Whether no mode has parameters among the unknowns."""
+        return not any(mode.family.size for mode in self.modes)
+
     def v0_slice(self, component: int) -> slice:
         """Where v0 along x (0) or y (1) is among the unknowns."""
         n = self.v0_space.size

@@ -62,7 +62,7 @@ def test_images_alone_lead_where_the_papers_start_leads(images: ImageSet) -> Non
     """After buckling, at 12.8 %: nothing but images, masks, cell size and the cellular part."""
     start = start_of(images, 0.128)
     assert start.family == "square"
-    assert not start.fixed
+    assert not start.ansatz.fixed
     found = correlated(images, 0.128, start.ansatz, start.unknowns)
     assert found.outcome is Outcome.CONVERGED
     setup = SquareLatticeOptions()
@@ -76,7 +76,7 @@ def test_images_alone_lead_where_the_papers_start_leads(images: ImageSet) -> Non
 def test_without_a_pattern_the_mode_is_held(images: ImageSet) -> None:
     """Before buckling, at 7.8 %: the lattice's own pattern, its origin on a junction, held."""
     start = start_of(images, 0.078)
-    assert start.fixed
+    assert start.ansatz.fixed
     assert start.patterns[0].family == "none"
     assert start.ansatz.modes[0].family.size == 0
     assert any("fixed at the square pattern" in s for s in start.text)

@@ -62,8 +62,6 @@ class InitialGuess:
     patterns: tuple[WavePattern, ...]
     """What the spectra of the field show, part by part; the modes follow one another likewise."""
     local: LocalField
-    fixed: bool
-    """Whether the modes are fixed because no pattern is observable."""
     text: tuple[str, ...]
 
     @property
@@ -120,23 +118,23 @@ def initial_guess(
                 f"The waves share no vector of the reciprocal lattice: {len(families)} modes, each "
                 "with an amplitude of its own."
             )
-    fixed = not modes
-    if fixed and cells.square:
+    if not modes and cells.square:
         modes = [(fixed_square(cells), box) for box in boxes]
         text.append(
             "The mode is fixed at the square pattern that the lattice of holes allows: without a "
             "pattern, its parameters aren't observable."
         )
-    elif fixed:
+    elif not modes:
         text.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
     ansatz = Ansatz.on(domain, modes, cell_size, options)
-    fit = _fitted(ansatz, local, fixed)
-    fitted = " and ".join(["v0", *(f"v{i + 1}" for i in range(0 if fixed else len(modes)))])
+    fit = _fitted(ansatz, local)
+    count = 0 if ansatz.fixed else len(modes)
+    fitted = " and ".join(["v0", *(f"v{i + 1}" for i in range(count))])
     text.append(
         f"{fitted} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
         "aside."
     )
-    return InitialGuess(ansatz, fit.coefficients, patterns, local, fixed, tuple(text))
+    return InitialGuess(ansatz, fit.coefficients, patterns, local, tuple(text))
 
 
 NEARLY_SQUARE = 0.05
@@ -288,10 +286,10 @@ def fixed_square(cells: Cells) -> ModeFamily:
     return replace(square_family(), start=start).moved(cells.junction).fixed()
 
 
-def _fitted(ansatz: Ansatz, local: LocalField, fixed: bool) -> RobustFit:
+def _fitted(ansatz: Ansatz, local: LocalField) -> RobustFit:
     """v0 and every v_i through the field; a mode that isn't observable isn't fitted."""
     a, slow = ansatz.initial_guess(), min(SLOW_DEGREE, ansatz.v0_degree)
-    if not fixed:
+    if not ansatz.fixed:
         return fit_unknowns(ansatz, a, local, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
     alone = replace(ansatz, modes=(), brightness=Brightness())
     fit = fit_unknowns(alone, np.zeros(alone.size), local, slow)
@@ -300,11 +298,13 @@ def _fitted(ansatz: Ansatz, local: LocalField, fixed: bool) -> RobustFit:
 
 def chosen_modes(
     guess: InitialGuess, geometry: Geometry, cell_size: float, how: PhotographOptions
-) -> tuple[Ansatz, FloatArray, bool]:
+) -> tuple[Ansatz, FloatArray]:
     """The guess's ansatz and unknowns with the specified family, its modes fixed or not."""
-    ansatz, unknowns, fixed = guess.ansatz, guess.unknowns, guess.fixed
+    ansatz, unknowns = guess.ansatz, guess.unknowns
     wants_square = how.family == "square" and geometry.lattice is not None
-    if (wants_square and "square" not in guess.family) or (fixed and how.fixed_mode is False):
+    if (wants_square and "square" not in guess.family) or (
+        ansatz.fixed and how.fixed_mode is False
+    ):
         if geometry.lattice is None:
             raise InputError(
                 "correlation: expected fixed_mode true or 'auto' where no pattern and no lattice "
@@ -316,11 +316,9 @@ def chosen_modes(
         ansatz = replace(ansatz, modes=Ansatz.on(ansatz.domain, families, cell_size).modes)
         unknowns = ansatz.initial_guess()
         unknowns[: v0.size] = v0
-        fixed = False
-    if how.fixed_mode is True and not fixed:
-        ansatz, unknowns = with_fixed_modes(ansatz, unknowns)
-        fixed = True
-    return ansatz, unknowns, fixed
+    if how.fixed_mode is True and not ansatz.fixed:
+        return with_fixed_modes(ansatz, unknowns)
+    return ansatz, unknowns
 
 
 def with_fixed_modes(ansatz: Ansatz, unknowns: FloatArray) -> tuple[Ansatz, FloatArray]:

@@ -97,7 +97,6 @@ class MeasuredPhotograph:
     result: Result
     local: LocalField
     """The displacement field behind the initial guess, a local DIC's if there is one."""
-    fixed: bool
     text: tuple[str, ...]
 
 
@@ -135,10 +134,10 @@ def measure(
         pair, cell_size, boxes, local=local, holes=holes, lattice=geometry.lattice_mm,
         domain=geometry.region.domain, options=how,
     )  # fmt: skip
-    ansatz, unknowns, fixed = chosen_modes(guess, geometry, cell_size, how)
+    ansatz, unknowns = chosen_modes(guess, geometry, cell_size, how)
     text = (matching, *_guess_text(guess, ansatz, geometry))
     options, found = how.options(), None
-    if before is not None and _goes_on(before, ansatz, unknowns, fixed):
+    if before is not None and _goes_on(before.result, ansatz, unknowns):
         again, there = _with_brightness(before.result, how)
         found = correlate(pair, again, guess=there, options=options, progress=progress)
     if found is not None and found.outcome is Outcome.CONVERGED:
@@ -146,7 +145,7 @@ def measure(
     else:
         found = correlate(pair, ansatz, guess=unknowns, options=options, progress=progress)
     assert found.final_smoothing is not None  # as asked for by how.options()
-    return MeasuredPhotograph(found, guess.local, fixed, (*text, found.final_smoothing.text))
+    return MeasuredPhotograph(found, guess.local, (*text, found.final_smoothing.text))
 
 
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
@@ -158,12 +157,11 @@ def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, Fl
     return ansatz, start
 
 
-def _goes_on(before: MeasuredPhotograph, ansatz: Ansatz, unknowns: FloatArray, fixed: bool) -> bool:
+def _goes_on(before: Result, ansatz: Ansatz, unknowns: FloatArray) -> bool:
     """Whether the result before is an initial guess: converged, with all waves observed now."""
-    result = before.result
-    if result.outcome is not Outcome.CONVERGED or before.fixed != fixed:
+    if before.outcome is not Outcome.CONVERGED or before.ansatz.fixed != ansatz.fixed:
         return False
-    return not shows_more(ansatz, unknowns, result.ansatz, result.unknowns)
+    return not shows_more(ansatz, unknowns, before.ansatz, before.unknowns)
 
 
 def _guess_text(guess: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tuple[str, ...]:

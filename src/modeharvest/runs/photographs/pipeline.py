@@ -57,7 +57,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
-from modeharvest.util.typed import picked, to_plain
+from modeharvest.util.typed import to_plain
 from modeharvest.validation.onset import find_buckling, mean_strain
 
 _ALONG = 120
@@ -212,12 +212,13 @@ class HarvestRun(StagedRun[PhotographCase]):
             result, field = self._paths(name)
             write_field(field, measured.local)
             measured.result.write(result)
-            return (result, field), picked(measured, "fixed text")
+            start = {"fixed": measured.result.ansatz.fixed, "text": measured.text}
+            return (result, field), start
 
         def read(name: str, start: dict[str, Any]) -> MeasuredPhotograph:
             result, field = self._paths(name)
             outcome = Result.read(result), read_field(field)
-            return MeasuredPhotograph(*outcome, start["fixed"], tuple(start["text"]))
+            return MeasuredPhotograph(*outcome, tuple(start["text"]))
 
         folder, nothing = self.folder / "results", {"fixed": False, "text": ()}
         return self.do_in_turn("correlate", self._keys, folder, work, read, nothing)
