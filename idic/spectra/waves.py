@@ -230,16 +230,14 @@ class Selection:
     """(w, 2) complex z [unit of the field]: the waves' sum is Im Σ z exp(2πi ξ·x/l)."""
     star: tuple[int, ...]
     """(w,) which of the stars each belongs to, from 0."""
-    captured: float
-    """Share of ∫ |u|² over the material that they explain [-]."""
     growth: tuple[tuple[int, float], ...]
-    """(number of waves, share), also beyond those chosen."""
+    """(number of waves, share of ∫ |u|² over the material), also beyond those chosen."""
 
     @property
     def next_gain(self) -> float:
         """What the next star would have explained in addition [-]; 0 if there is none left."""
-        later = [share for count, share in self.growth if count > len(self.xi)]
-        return later[0] - self.captured if later else 0.0
+        shares = [share for count, share in self.growth if count >= len(self.xi)]
+        return shares[1] - shares[0] if len(shares) > 1 else 0.0
 
 
 class WaveFit:
@@ -294,9 +292,9 @@ def select_waves(
     while kept < len(curve) and curve[kept][1] - curve[kept - 1][1] >= growth:
         kept += 1
     waves = [wave for star in order[:kept] for wave in star]
-    amplitudes, captured, _ = fit.solve(waves)
+    amplitudes, _, _ = fit.solve(waves)
     labels = tuple(s for s, star in enumerate(order[:kept]) for _ in star)
-    return Selection(xi[waves], amplitudes, labels, captured, tuple(curve))
+    return Selection(xi[waves], amplitudes, labels, tuple(curve))
 
 
 def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
