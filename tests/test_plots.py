@@ -184,7 +184,7 @@ def test_the_rings_are_at_the_wave_vectors(data: ExperimentData) -> None:
         PlaneWave((1.0, 0.9), (0.1, 0.1), 0.0, 0.0),
         PlaneWave((-1.0, 0.8), (0.1, 0.1), 0.0, 0.0),
     )
-    pattern = WavePattern(waves, None, "unknown", None, 0.0, ())
+    pattern = WavePattern(waves, None, ())
     drawn = draw_density(spectrum, pattern, 0, pattern_density(spectrum, pattern))
     rings = {tuple(np.ravel(line.get_xydata()).tolist()) for line in drawn.axes[0].lines}
     # In units of 1/l, half of those of pi/l; a real wave has two vectors.
@@ -194,7 +194,7 @@ def test_the_rings_are_at_the_wave_vectors(data: ExperimentData) -> None:
 def test_the_colours_of_a_density_end_at_the_pattern() -> None:
     made_spectrum, _ = made_up.spectrum(made_up.comparison(0.1, 4.0))
     wave = PlaneWave((1.0, 1.0), (0.1, 0.1), 0.0, 0.0)
-    pattern = WavePattern((wave,), None, "unknown", None, 0.0, ())
+    pattern = WavePattern((wave,), None, ())
     end = pattern_density(made_spectrum, pattern)
     assert end == np.max(np.abs(made_spectrum.at((0.5, 0.5))) ** 2)
     image = draw_density(made_spectrum, pattern, 1, end).axes[0].images[0]
