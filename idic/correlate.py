@@ -394,16 +394,14 @@ def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> W
     it is aliased, in the residual and in the deformed image's gradient alike.
     """
     is_noise, is_aliased = result.residual_test().is_white, size_px < _FINEST_PX
-    gradient, blur_px, low_pass = options.gradient, options.gradient_blur_px, 0
+    gradient, blur_px, low_pass = options.gradient, options.gradient_blur_px, False
     if gradient is None:
         gradient = "reference" if is_noise or is_aliased else "deformed"
     if blur_px is None:
         blur_px = best_blur(result.noise_to_slope, size_px, result.order) if is_noise else 0.0
-        low_pass = _LOW_PASS if is_aliased and not blur_px else 0
+        low_pass = is_aliased and not blur_px
     return Weighting(Gradient(gradient), blur_px, size_px, low_pass)
 
 
 _FINEST_PX = 4.0
 """Finer speckle is aliased by the pixels; a filter keeps that out of what weighs the residual."""
-_LOW_PASS = 3
-"""benchmarks/small_motion.py: of a higher order it leaves more bias, of a lower more scatter."""

@@ -15,7 +15,7 @@ import numpy as np
 from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict
 from modeharvest.idic.solver.final_smoothing import FinalSmoothing
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
-from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, slope_noise
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer
 from modeharvest.idic.solver.residual_test import LAGS_PX, ResidualTest
 from modeharvest.idic.solver.weighting import Gradient, Weighting
 from modeharvest.imaging.grid import PixelGrid
@@ -190,7 +190,7 @@ class Result:
         if self.weight_square <= 0.0:
             return 0.0
         weighting = self.weighting
-        slope = slope_noise(self.order, weighting.blur_px, weighting.low_pass)
+        slope = weighting.slope_noise(self.order)
         if weighting.gradient is Gradient.REFERENCE:
             made = noise.reference**2 * slope
         elif not weighting.is_least_squares:
@@ -325,7 +325,7 @@ def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
             Gradient(weighting["gradient"]),
             weighting["blur_px"],
             size_px,
-            weighting.get("low_pass", 0),  # not there in older files
+            bool(weighting.get("low_pass")),  # not there in older files
         ),
         "final_smoothing": smoothing
         and FinalSmoothing(**{k: _or(np.nan, v) for k, v in smoothing.items()}),

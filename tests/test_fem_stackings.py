@@ -45,9 +45,11 @@ NONE = VirtualWholeFieldOptions(measure=False)
 FEW = SquareLatticeOptions(v0_degree=3, v_degree=1)
 
 
-def summary_of(specimen: Specimen, strain: float, folder: Path, v_degree: int) -> dict[str, Any]:
+def summary_of(
+    specimen: Specimen, strain: float, folder: Path, v_degree: int, fixed_mode: bool = False
+) -> dict[str, Any]:
     experiment = Experiment(specimen, strains=(strain,), mesh_size=0.35)
-    how = SquareLatticeOptions(v0_degree=4, v_degree=v_degree)
+    how = SquareLatticeOptions(v0_degree=4, v_degree=v_degree, fixed_mode=fixed_mode)
     case = Case(experiment=experiment, imaging=IMAGING, correlation=how, whole_field=NONE)
     return Run(case, folder).all()
 
@@ -69,7 +71,8 @@ def test_ellipses_in_rectangular_stacking_buckle_and_are_measured(tmp_path: Path
 
 def test_a_triangular_specimen_from_simulation_to_report(tmp_path: Path) -> None:
     specimen = Specimen(3, 7, diameter=1.7, stacking="triangular")
-    summary = summary_of(specimen, 0.1, tmp_path, 1)
+    # Three free modes are not observable on so few cells: most starts end nowhere in particular.
+    summary = summary_of(specimen, 0.1, tmp_path, 1, fixed_mode=True)
     (snapshot,), critical = summary["snapshots"], summary["critical"]
     assert (critical["negative_pivots_below"], critical["negative_pivots_above"]) == (0, 1)
     assert "pattern_overlap" not in critical
@@ -80,10 +83,12 @@ def test_a_triangular_specimen_from_simulation_to_report(tmp_path: Path) -> None
     assert lattice.load < critical["strain"] < 5.0 * lattice.load
     assert (snapshot["branch"], snapshot["outcome"]) == ("buckled+", "converged")
     assert snapshot["rms_best_fit_px"] <= snapshot["rms_w_px"] < 1.5
-    assert [mode["name"] for mode in snapshot["modes"]] == [
+    assert snapshot["rms_idic_to_best_fit_px"] < 0.3 * snapshot["rms_w_px"]
+    free = SquareLatticeOptions().ansatz(specimen)
+    assert [mode.family.name for mode in free.modes] == [
         "zone boundary (1, 0)", "zone boundary (0, 1)", "zone boundary (1, 1)"
     ]  # fmt: skip
-    assert not {"mode", "mode_ideal", "mode_deviation_percent"} & set(snapshot)
+    assert not {"mode", "modes", "mode_ideal", "mode_deviation_percent"} & set(snapshot)
     page = (tmp_path / "report.html").read_text("utf-8")
     for i in (1, 2, 3):
         assert f'id="v{i}-1000"' in page

@@ -21,7 +21,7 @@ from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.assembly import Assembly, warped_back
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, Outcome
 from modeharvest.idic.solver.level_search import step_length
-from modeharvest.idic.solver.noise import ImageNoise, slope_noise
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, level_pair
 from modeharvest.idic.solver.weighting import Gradient, Weighting, best_blur, instrument, root
 from modeharvest.imaging.grid import PixelGrid
@@ -107,27 +107,37 @@ def test_the_reference_s_gradient_pushed_forward_is_the_deformed_image_s() -> No
     assert abs(plain[:2, level.mask] - of_g).max() > 0.03 * abs(of_g).max()
 
 
-@pytest.mark.parametrize("low_pass", [1, 3])
-def test_a_low_pass_filter_leaves_nothing_at_the_nyquist_limit(low_pass: int) -> None:
-    """Slopes of filtered waves along x, at the pixels: 2 pi k (1 - sin^2p(pi k)) of the exact."""
+@pytest.mark.parametrize("size_px", [2.0, 3.0, 4.0])
+def test_a_low_pass_filter_leaves_nothing_at_the_nyquist_limit(size_px: float) -> None:
+    """Slopes of waves along x at the pixels, filtered and not; and of noise."""
+    filtered = Weighting(Gradient.REFERENCE, 0.0, size_px, low_pass=True)
 
-    def slopes(image: FloatArray) -> FloatArray:
+    def slopes(image: FloatArray, weighting: Weighting = filtered) -> FloatArray:
         images = ImagePair(image, image, GRID, MASK)
         level = level_pair(images, FULL, edge_px=2, order=11)
         used = Assembly(ANSATZ, GRID, level.mask)
-        weighting = Weighting(Gradient.REFERENCE, low_pass=low_pass)
         inside = ndimage.binary_erosion(MASK, iterations=12)  # the spline's ends are elsewhere
         return instrument(weighting, images, level, used, np.zeros(ANSATZ.size))[0][inside] * PIXEL
 
     col = np.arange(GRID.shape[1])
-    for k in (0.02, 0.1, 0.25, 0.4):
+    for k in (0.02, 0.1, 0.25, 0.375):
         wave = np.tile(np.sin(2 * np.pi * k * col), (GRID.shape[0], 1))
-        passed = 1.0 - np.sin(np.pi * k) ** (2 * low_pass)
-        expected = np.sqrt(0.5) * 2 * np.pi * k * passed
-        assert np.std(slopes(wave)) == pytest.approx(expected, rel=0.03)
-    assert np.std(slopes(np.tile(np.cos(np.pi * col), (GRID.shape[0], 1)))) < 1e-6
-    noise = np.random.default_rng(low_pass).normal(size=GRID.shape)
-    assert np.var(slopes(noise)) == pytest.approx(slope_noise(11, 0.0, low_pass), rel=0.1)
+        whole = np.std(slopes(wave, Weighting(Gradient.REFERENCE)))
+        assert whole == pytest.approx(np.sqrt(0.5) * 2 * np.pi * k, rel=0.03)
+        passed = float(filtered.passed(np.array(k)))
+        assert np.std(slopes(wave)) == pytest.approx(whole * passed, rel=0.01, abs=1e-3)
+    assert np.std(slopes(np.tile(np.cos(np.pi * col), (GRID.shape[0], 1)))) < 1e-3
+    noise = np.random.default_rng(3).normal(size=GRID.shape)
+    assert np.var(slopes(noise)) == pytest.approx(filtered.slope_noise(11), rel=0.1)
+
+
+def test_half_of_a_wave_is_left_where_its_aliased_part_is_a_hundredth_of_it() -> None:
+    """By the power spectrum of a speckle whose autocorrelation is 3 px wide, a Gaussian."""
+    L = 3.0 / np.sqrt(8.0 * np.log(2.0))
+    k = np.linspace(0.0, 0.5, 501)
+    amplitude = np.exp(-((np.pi * L) ** 2) * ((1.0 - k) ** 2 - k**2))
+    passed = Weighting(Gradient.REFERENCE, 0.0, 3.0, low_pass=True).passed(k)
+    np.testing.assert_allclose(passed, 1.0 / (1.0 + (amplitude / 0.01) ** 2), rtol=1e-12)
 
 
 def test_noise_free_images_keep_the_least_squares_minimum() -> None:
@@ -387,7 +397,7 @@ def test_aliasing_is_kept_out_of_what_weighs_the_residual() -> None:
     assert not found.residual_test().is_white
     assert found.weighting.speckle_size_px < 4.0
     assert found.weighting.gradient is Gradient.REFERENCE
-    assert found.weighting.low_pass > 0
+    assert found.weighting.low_pass
 
 
 def test_least_squares_has_one() -> None:

@@ -200,18 +200,12 @@ def spline_autocorrelation(
     return np.asarray(np.transpose(found) / np.mean(across * down))
 
 
-def slope_noise(order: int, blur_px: float, low_pass: int = 0) -> float:
-    """Variance at a pixel of the slope of white noise of variance 1, filtered first [1/px^2].
+def slope_noise(order: int, blur_px: float) -> float:
+    """Variance at a pixel of the slope of white noise of variance 1, blurred first [1/px^2].
 
     The order is that of the spline whose slope it is. Of a Gaussian blur of standard deviation s,
-    from 0.6 px on, that is 1/(8 pi s^4), to 11 % at 0.6 px, 4 % at 0.8 px and 1 % at 1 px; of a
-    low-pass filter (see :class:`~modeharvest.idic.solver.weighting.Weighting`) it is that of an
-    ideal interpolation.
+    from 0.6 px on, that is 1/(8 pi s^4), to 11 % at 0.6 px, 4 % at 0.8 px and 1 % at 1 px.
     """
-    if low_pass:
-        k = np.linspace(0.0, 0.5, 1001)
-        power = (1.0 - np.sin(np.pi * k) ** (2 * low_pass)) ** 2
-        return float((np.square(2.0 * np.pi * k) * power).mean() * power.mean())
     if blur_px > 0.0:
         return float(1.0 / (8.0 * np.pi * blur_px**4))
     return float(_variances(order, np.zeros(1))[1][0])

@@ -58,6 +58,9 @@ from modeharvest.util.scaled_eigen import ScaledEigen
 
 WORTH_IT = 0.01
 """Share of the unknowns' variance for which a blur is worth having [-]."""
+ALIASED = 1e-4
+"""Power of the aliased part of a wave over its own where the low-pass filter leaves half [-]: where
+benchmarks/small_motion.py sees neither bias nor much more scatter."""
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
@@ -79,15 +82,14 @@ class Weighting:
     """Standard deviation of a blur of the image whose gradient it is [px]; 0 for none."""
     speckle_size_px: float = np.inf
     """Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known."""
-    low_pass: int = 0
-    """Order p of a filter of that image's rows and columns, 1 - sin^2p(pi k) at the frequency k
-    [cycles/px], that leaves nothing at the Nyquist limit, where aliasing is; 0 for none."""
+    low_pass: bool = False
+    """Whether that image's rows and columns are filtered, see :meth:`passed`."""
 
     def __post_init__(self) -> None:
-        if not (self.blur_px >= 0 and self.speckle_size_px > 0 and self.low_pass >= 0):
+        if not (self.blur_px >= 0 and self.speckle_size_px > 0):
             raise InputError(
-                "expected a blur of at least 0 px, a speckle wider than 0 px and a filter of order "
-                f"0 or more, got {self.blur_px}, {self.speckle_size_px} and {self.low_pass}"
+                "expected a blur of at least 0 px and a speckle wider than 0 px, "
+                f"got {self.blur_px} and {self.speckle_size_px}"
             )
 
     @property
@@ -109,6 +111,29 @@ class Weighting:
             return 0.5 * noise
         t = (self.blur_px * _FWHM / self.speckle_size_px) ** 2
         return float((1.0 + t) ** 4 * (1.0 / (1.0 + 2.0 * t) ** 2 + 0.5 * noise) - 1.0)
+
+    def passed(self, k: NDArray[Any]) -> FloatArray:
+        """Share that the low-pass filter leaves of a wave of ``k`` = 0 ... 0.5 cycles/px [-].
+
+        Pixels take the wave 1 - k for k. A speckle whose autocorrelation is exp(-r^2/(2 L^2)) has
+        the power S(k) ~ exp(-(2 pi L k)^2/2), and of that much of a wave, S(1 - k)/S(k), aliasing
+        has a part; half is left where that is :data:`ALIASED`. It would be a bias of the
+        displacement, because residual and weight share it.
+        """
+        k_L = _FWHM / (2.0 * np.pi * self.speckle_size_px)
+        aliased = np.exp((k - 0.5) / k_L**2)
+        return np.asarray(1.0 / (1.0 + aliased / ALIASED))
+
+    def slope_noise(self, order: int) -> float:
+        """Variance at a pixel of the slope of white noise of variance 1, filtered so [1/px^2].
+
+        ``order`` is the spline's; after a low-pass filter it is taken for ideal.
+        """
+        if not self.low_pass:
+            return slope_noise(order, self.blur_px)
+        k = np.linspace(0.0, 0.5, 1001)
+        power = self.passed(k) ** 2
+        return float((np.square(2.0 * np.pi * k) * power).mean() * power.mean())
 
     @property
     def text(self) -> str:
@@ -150,6 +175,8 @@ _BLURS_PX = tuple(LEAST_BLUR_PX + 0.05 * k for k in range(69))
 
 _FAR = 10.0
 """Steps longer than that many times the first one: it runs away."""
+_REACH_PX = 48
+"""To either side, of the low-pass filter [px]; its weights have fallen to 1 % by then."""
 _NEIGHBOURS_PX = 1.0
 """Blur by which a pixel's neighbours stand for it where a gain is among the unknowns [px]."""
 
@@ -189,11 +216,10 @@ def _filtered(
     passed = np.asarray(image, np.float32)
     if mask is not None:
         passed = np.where(mask, passed, smoothed(image, mask, _NEIGHBOURS_PX))
-    high: FloatArray = np.ones(1)
-    for _ in range(weighting.low_pass):
-        high = np.convolve(high, (-0.25, 0.5, -0.25)).astype(np.float64)
+    response = weighting.passed(np.fft.rfftfreq(2 * _REACH_PX))
+    weights = np.fft.fftshift(np.fft.irfft(response))[1:]  # odd: symmetric about its middle
     for axis in (0, 1):
-        passed = passed - ndimage.convolve1d(passed, high, axis, mode="mirror")
+        passed = ndimage.convolve1d(passed, weights, axis, mode="mirror")
     return passed
 
 
