@@ -65,7 +65,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if session.config.getoption("numprocesses", None):
         from modeharvest.runs.precompile import precompiling
 
-        with precompiling(("image", "correlate")) as kernels:
+        with precompiling(("image", "correlate", "measure")) as kernels:
             for stage in kernels.children:
                 kernels.wait(stage)
 

@@ -28,7 +28,6 @@ from modeharvest.idic.finite_element.system import Body
 from modeharvest.runs import run, whole_field
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
-from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.util.progress import Progress
@@ -47,6 +46,8 @@ pixel_size = 0.08
 seed = 3
 [whole_field]
 measure = false
+element_px = 16.0
+edge_element_px = 10.0
 """
 
 pytestmark = [pytest.mark.dolfinx, pytest.mark.usefixtures("coarse_pictures")]
@@ -112,12 +113,15 @@ def test_the_run_leaves_what_it_promises(finished: Path) -> None:
 
 
 def test_the_whole_displacement_is_measured_up_to_the_edges(
-    case: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+    case: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(whole_field, "get_num_threads", lambda: 2)
-    how = VirtualWholeFieldOptions(measure=True, element_px=16.0, edge_element_px=10.0)
-    whole = Case.read(case).model_copy(update={"whole_field": how})
-    run(whole, folder)
+    where = case, "--out", folder, "--whole-field"
+    assert called(monkeypatch, "validate", *where) == 2
+    assert "make them with 'modeharvest correlate'" in error_line(capsys)
+    assert called(monkeypatch, "correlate", *where) == 0
+    assert capsys.readouterr().out.count("whole displacement: ") == 2
+    assert called(monkeypatch, "validate", *where) == 0
     summary = read_json(folder / "summary.json")
     for snapshot in summary["snapshots"]:
         found = snapshot["whole_field"]
@@ -131,6 +135,9 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
         assert read_result(folder / "whole_field" / name).unknowns == found["unknowns"]
     page = (folder / "report.html").read_text("utf-8")
     assert "Whole displacement" in page
+    given = Case.read(case)
+    how = replace(given.whole_field, measure=True)
+    whole = given.model_copy(update={"whole_field": how})
     before = stamps(folder)
     run(whole, folder)
     assert not changed(before, stamps(folder))
@@ -168,18 +175,6 @@ def test_a_killed_process_is_no_fault_of_the_program() -> None:
         whole_field._children(1) as [child],
     ):
         child.kill()
-
-
-def test_the_stages_commands_measure_it_too(
-    case: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    where = case, "--out", folder, "--whole-field"
-    assert called(monkeypatch, "validate", *where) == 2
-    assert "make them with 'modeharvest correlate'" in error_line(capsys)
-    assert called(monkeypatch, "correlate", *where) == 0
-    assert capsys.readouterr().out.count("whole displacement: ") == 2
-    assert called(monkeypatch, "validate", *where) == 0
-    assert all("whole_field" in s for s in read_json(folder / "summary.json")["snapshots"])
 
 
 def test_summary_holds_the_documented_keys_and_sound_numbers(finished: Path) -> None:
