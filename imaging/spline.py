@@ -5,9 +5,9 @@ a recursive filter, forwards and backwards, once for every pole; the mirrored bo
 A sample costs 16, 36 or 144 coefficients. Speckles below 6 px want order 11: docs/metrology.md.
 
 Compilers turn loops over many points into vectors, but here neighbouring points read from places
-that differ; what can go side by side are the taps of a row: the six of a quintic spline as a vector
-of eight whose last two weights are zero, the twelve of one of order 11 as a vector of sixteen. LLVM
-splits them where the machine's vectors are shorter.
+that differ; what can go side by side are the taps of a row: the four of a cubic spline as a vector,
+the six of a quintic one as a vector of eight whose last two weights are zero, the twelve of one of
+order 11 as a vector of sixteen. LLVM splits them where the machine's vectors are shorter.
 
 Source: Unser, Aldroubi, Eden 1993, doi 10.1109/78.193220 (poles, initial values).
 """
@@ -76,7 +76,7 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     z = poles(order)
     gain = float(np.prod((1.0 - z) * (1.0 - 1.0 / z)))
     in_parallel(_filter_columns, readable(image), z, _mirrored(z, rows), gain, interior)
-    in_parallel(_filter_rows, z, _mirrored(z, cols), gain, interior)
+    in_parallel(_filter_columns, interior.T, z, _mirrored(z, cols), gain, interior.T)
     _pad_mirrored(padded, pad)
     return padded
 
@@ -126,6 +126,7 @@ def _filter(lines: Any, n: int, poles: Any, first: Any, gain: float) -> None:
 def _filter_columns(
     image: Any, poles: Any, first: Any, gain: float, out: Any, thread: int, threads: int
 ) -> None:
+    """Filter ``image`` along its columns into ``out``, which may be the image itself."""
     rows, cols = image.shape
     for block in range(thread, (cols + _LINES - 1) // _LINES, threads):
         lines = np.zeros((rows, _LINES))
@@ -137,23 +138,6 @@ def _filter_columns(
         for i in range(rows):
             for m in range(width):
                 out[i, left + m] = lines[i, m]
-
-
-@compiled(relaxed=True)
-def _filter_rows(
-    poles: Any, first: Any, gain: float, image: Any, thread: int, threads: int
-) -> None:
-    rows, cols = image.shape
-    for block in range(thread, (rows + _LINES - 1) // _LINES, threads):
-        lines = np.zeros((cols, _LINES))
-        top, height = block * _LINES, min(_LINES, rows - block * _LINES)
-        for m in range(height):
-            for j in range(cols):
-                lines[j, m] = image[top + m, j]
-        _filter(lines, cols, poles, first, gain)
-        for m in range(height):
-            for j in range(cols):
-                image[top + m, j] = lines[j, m]
 
 
 def _pad_mirrored(padded: NDArray[Any], pad: int) -> None:
@@ -176,13 +160,13 @@ _RELAXED = ("contract", "reassoc", "nsz", "arcp")
 def lane_weights(order: int) -> FloatArray:
     """(order + 1, lanes): a tap's weight at the fraction t is a sum over t^power, power by lane.
 
-    There are eight lanes or sixteen, of which the last are zero. Lane 0 is the tap (order - 1)/2
+    There are 4, 8 or 16 lanes, of which the last may be zero. Lane 0 is the tap (order - 1)/2
     pixels to the left of the one that t counts from.
     """
     taps = order + 1
     pieces = PPoly.from_spline(BSpline.basis_element(np.arange(taps + 1.0)))
     first = int(np.searchsorted(pieces.x, 0.0, side="right")) - 1
-    found = np.zeros((taps, 8 * -(-taps // 8)))
+    found = np.zeros((taps, 1 << (taps - 1).bit_length()))
     # Highest power first, and from the left end of the spline, where the last tap is.
     found[:, :taps] = pieces.c[::-1, first : first + taps][:, ::-1]
     return found
@@ -265,15 +249,13 @@ def _sampler(order: int) -> Any:
     return at
 
 
-quintic_at = cast(Any, _sampler(5))
-"""(value, d_row, d_col) from c[i : i + 6, j : j + 6]; reads two values to the right of them.
+_cubic, _quintic, _eleventh = (cast(Any, _sampler(order)) for order in ORDERS)
+"""(value, d_row, d_col) from c[i : i + taps, j : j + taps], as many taps as the order and one.
 
-The fractions t_row and t_col count from the third of the six. c has to be contiguous, and to have
-a row below the six: what is read to the right of the last column is that row's beginning.
+The fractions t_row and t_col count from the last tap of the first half. What is read to the right
+of the taps, two values or four, has no weight; c has to be contiguous, and to have a row below
+them: what is read to the right of the last column is that row's beginning.
 """
-eleventh_at = cast(Any, _sampler(11))
-"""The same from c[i : i + 12, j : j + 12], four values read to the right of them, with fractions
-that count from the sixth."""
 
 
 PAD = 6
@@ -323,74 +305,23 @@ class SplineImage:
         return value.reshape(row.shape), d_row.reshape(row.shape), d_col.reshape(row.shape)
 
 
-@compiled(inline=True, relaxed=True)
-def cubic_weights(t: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Weights of the 4 taps -1 ... 2 and their derivatives, at the fraction 0 <= t <= 1."""
-    s = 1.0 - t
-    sixth = 1.0 / 6.0
-    w = (
-        s * s * s * sixth,
-        (4.0 + t * t * (3.0 * t - 6.0)) * sixth,
-        (4.0 + s * s * (3.0 * s - 6.0)) * sixth,
-        t * t * t * sixth,
-    )
-    d = (-0.5 * s * s, t * (1.5 * t - 2.0), -s * (1.5 * s - 2.0), 0.5 * t * t)
-    return w, d
-
-
-@compiled(inline=True, relaxed=True)
-def _dot4(c: Any, i: int, j: int, w: Any) -> float:
-    total: float = w[0] * c[i, j] + w[1] * c[i + 1, j] + w[2] * c[i + 2, j] + w[3] * c[i + 3, j]
-    return total
-
-
-@compiled(inline=True, relaxed=True)
-def sample_cubic(c: Any, row: float, col: float) -> tuple[float, float, float]:
-    """(value, d_row, d_col) at a position inside the image [px]."""
-    i, j = min(int(row), c.shape[0] - 2 * PAD - 2), min(int(col), c.shape[1] - 2 * PAD - 2)
-    wr, dr = cubic_weights(row - i)
-    wc, dc = cubic_weights(col - j)
-    i, j = i + PAD - 1, j + PAD - 1
-    a0, a1 = _dot4(c, i, j, wr), _dot4(c, i, j + 1, wr)
-    a2, a3 = _dot4(c, i, j + 2, wr), _dot4(c, i, j + 3, wr)
-    b0, b1 = _dot4(c, i, j, dr), _dot4(c, i, j + 1, dr)
-    b2, b3 = _dot4(c, i, j + 2, dr), _dot4(c, i, j + 3, dr)
-    return (
-        a0 * wc[0] + a1 * wc[1] + a2 * wc[2] + a3 * wc[3],
-        b0 * wc[0] + b1 * wc[1] + b2 * wc[2] + b3 * wc[3],
-        a0 * dc[0] + a1 * dc[1] + a2 * dc[2] + a3 * dc[3],
-    )
-
-
-@compiled(inline=True, relaxed=True)
-def sample_quintic(c: Any, row: float, col: float) -> tuple[float, float, float]:
-    """(value, d_row, d_col) at a position inside the image [px]."""
-    i, j = min(int(row), c.shape[0] - 2 * PAD - 2), min(int(col), c.shape[1] - 2 * PAD - 2)
-    found: tuple[float, float, float] = quintic_at(c, i + PAD - 2, j + PAD - 2, row - i, col - j)
-    return found
-
-
-@compiled(inline=True, relaxed=True)
-def sample_eleventh(c: Any, row: float, col: float) -> tuple[float, float, float]:
-    """(value, d_row, d_col) at a position inside the image [px]."""
-    i, j = min(int(row), c.shape[0] - 2 * PAD - 2), min(int(col), c.shape[1] - 2 * PAD - 2)
-    found: tuple[float, float, float] = eleventh_at(c, i + PAD - 5, j + PAD - 5, row - i, col - j)
-    return found
-
-
 @compiled(relaxed=True)
 def sample_points(
     c: Any, order: int, row: Any, col: Any, n: int, value: Any, d_row: Any, d_col: Any
 ) -> None:
     """Fill value, d_row and d_col at the first n positions; NaN outside the image."""
-    last_row, last_col = c.shape[0] - 2 * PAD - 1.0, c.shape[1] - 2 * PAD - 1.0
+    last_row, last_col = c.shape[0] - 2 * PAD - 1, c.shape[1] - 2 * PAD - 1
+    before = PAD - (order - 1) // 2
     for k in range(n):
         r, q = row[k], col[k]
         if not (0.0 <= r <= last_row and 0.0 <= q <= last_col):
             value[k] = d_row[k] = d_col[k] = np.nan
-        elif order == 5:
-            value[k], d_row[k], d_col[k] = sample_quintic(c, r, q)
+            continue
+        i, j = min(int(r), last_row - 1), min(int(q), last_col - 1)
+        top, left, t_row, t_col = i + before, j + before, r - i, q - j
+        if order == 5:
+            value[k], d_row[k], d_col[k] = _quintic(c, top, left, t_row, t_col)
         elif order == 11:
-            value[k], d_row[k], d_col[k] = sample_eleventh(c, r, q)
+            value[k], d_row[k], d_col[k] = _eleventh(c, top, left, t_row, t_col)
         else:
-            value[k], d_row[k], d_col[k] = sample_cubic(c, r, q)
+            value[k], d_row[k], d_col[k] = _cubic(c, top, left, t_row, t_col)

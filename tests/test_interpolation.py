@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from modeharvest.imaging.spline import ORDERS, SplineImage, cubic_weights, lane_weights
+from modeharvest.imaging.spline import ORDERS, SplineImage, lane_weights
 from modeharvest.util.errors import InputError
 
 
@@ -17,9 +17,6 @@ def noise() -> np.ndarray:
 
 def weights_at(order: int, t: float) -> tuple[np.ndarray, np.ndarray]:
     """Weights and their derivatives; the last lanes are no taps."""
-    if order == 3:
-        w, d = cubic_weights(t)
-        return np.array(w), np.array(d)
     powers = lane_weights(order)
     slopes = np.arange(1, order + 1)[:, None] * powers[1:]
     return t ** np.arange(order + 1) @ powers, t ** np.arange(order) @ slopes
