@@ -11,7 +11,7 @@ time, whose mapping fits into its cache; of the whole image nothing is kept but 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.imaging.speckle.periodic_spline import (
     BLOCK,
-    PeriodicSpline,
     SplineTable,
     sample,
     workspace,
@@ -87,13 +86,18 @@ class ImagedState:
 
         ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
         """
-        mesh, nodes = self.mesh, self.nodes
+        mesh, nodes, grid, h = self.mesh, self.nodes, self.grid, self.grid.pixel_size
         require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
-        reach = float(np.abs(offsets).max(initial=0.0))
-        near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, selected, reach)], mesh.element)
-        total = _average_rows(
-            near, nodes, self.grid, self.speckle.spline, self.background, selected, offsets, weights
-        )
+        cells = mesh.cells[self._reaching(nodes, selected, float(np.abs(offsets).max(initial=0.0)))]
+        position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)
+        place, pattern = polynomials(mesh.element, cells, position), self.speckle.spline.table
+        total, selected = np.zeros(grid.shape), np.ascontiguousarray(selected)
+        for (down, right), weight in zip(offsets, weights, strict=True):
+            moved = replace(grid, x0=float(grid.x0 + h * right), y0=float(grid.y0 - h * down))
+            elements = tabulate_elements(nodes, cells, mesh.element, moved)
+            start, visits = bands(elements, grid.rows, _BAND)
+            in_parallel(_add, elements, place, pattern, self.background, start, visits,
+                        float(weight), selected, total)  # fmt: skip
         return total[selected]
 
     def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
@@ -173,35 +177,6 @@ def render_observed(state: ImagedState, points: Positions) -> Rendering:
     image = np.full(mask.shape, state.background, dtype=np.float32)
     image[mask] = state.speckle(row, col)
     return Rendering(image, mask)
-
-
-def _average_rows(
-    mesh: Mesh,
-    nodes: FloatArray,
-    grid: PixelGrid,
-    pattern: PeriodicSpline,
-    background: float,
-    selected: BoolArray,
-    offsets: FloatArray,
-    weights: FloatArray,
-) -> FloatArray:
-    """(rows, cols) weighted sum of grey levels at selected pixels moved by offsets; else wrong.
-
-    mesh, nodes : the undeformed mesh, whose Jacobians are proved positive in the state with the
-        node positions ``nodes`` (n, 2) [mm].
-    grid, pattern, background : the pixels, also the pattern's; intensity of material and around.
-    selected, offsets, weights : (rows, cols) True where to sum; (k, 2) (row, col) [px] and (k,).
-    """
-    total = np.zeros(grid.shape)
-    position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)
-    place, h = polynomials(mesh.element, mesh.cells, position), grid.pixel_size
-    for (down, right), weight in zip(offsets, weights, strict=True):
-        moved = PixelGrid(*grid.shape, h, float(grid.x0 + h * right), float(grid.y0 - h * down))
-        elements = tabulate_elements(nodes, mesh.cells, mesh.element, moved)
-        start, visits = bands(elements, grid.rows, _BAND)
-        in_parallel(_add, elements, place, pattern.table, background, start, visits,
-                    float(weight), np.ascontiguousarray(selected), total)  # fmt: skip
-    return total
 
 
 @compiled()

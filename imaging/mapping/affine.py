@@ -17,13 +17,13 @@ from modeharvest.imaging.mapping.element_table import (
     INSIDE,
     OVERLAPPING,
     UNASSIGNED,
-    ElementTable,
-    Pixels,
+    Band,
 )
 from modeharvest.imaging.mapping.inversion import (
     ON_EDGE,
     Coefficients,
     coefficients,
+    distance_px,
     outside,
     value,
 )
@@ -46,26 +46,14 @@ class _Inverse(NamedTuple):
 
 
 @compiled()
-def fill_affine(
-    elements: ElementTable,
-    fields: FloatArray,
-    pixels: Pixels,
-    e: int,
-    first: int,
-    last: int,
-    state: NDArray[np.uint8],
-    begin: int,
-) -> None:
-    """Assign the element's pixels in image rows ``first`` ... ``last`` - 1.
-
-    ``state`` holds those of a band of rows, whose pixels begin at ``begin``.
-    """
+def fill_affine(band: Band, e: int, first: int, last: int) -> None:
+    """Assign the element's pixels in image rows ``first`` ... ``last`` - 1."""
+    elements, fields, pixels, state, begin = band
     triangular, back = elements.triangular, _inverse(elements.polynomials[e])
     centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
     element, values, residual = pixels.element, pixels.values, pixels.residual
     x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
     first_row, cols, h = pixels.first_row, pixels.cols, pixels.pixel_size
-    x0, y0 = pixels.x0, pixels.y0
     for image_row in range(first, last):
         row = float(image_row - centre_row)
         low, high = _between(back, triangular, row)
@@ -88,12 +76,10 @@ def fill_affine(
                 _line(values[0, at : at + n], s, back.s_col)
                 _line(values[1, at : at + n], t, back.t_col)
             for k in range(fields.shape[1]):
-                a = (fields[e, k, 0], fields[e, k, 1], fields[e, k, 2], fields[e, k, 3],
-                     fields[e, k, 4], fields[e, k, 5], fields[e, k, 6], fields[e, k, 7],
-                     fields[e, k, 8])  # fmt: skip
+                a = coefficients(fields[e, k])
                 _run(values[k, at : at + n], a, not triangular, back, s, t)
             if residual.size:
-                place = (x0 + h * col, y0 - h * image_row, h)
+                place = (pixels.x0 + h * col, pixels.y0 - h * image_row, h)
                 _residuals(residual[at : at + n], x, y, not triangular, back, s, t, place)
             col += n
 
@@ -145,9 +131,8 @@ def _residuals(
     """Distances in the physical plane [px] along a row from (s, t) on."""
     x0, y0, h = place
     for k in range(out.size):
-        down = y0 - value(y, curved, s + k * back.s_col, t + k * back.t_col)
-        right = x0 + h * k - value(x, curved, s + k * back.s_col, t + k * back.t_col)
-        out[k] = np.sqrt(down * down + right * right) / h
+        at = x0 + h * k, y0, h
+        out[k] = distance_px(x, y, curved, s + k * back.s_col, t + k * back.t_col, at)
 
 
 @compiled(relaxed=True)

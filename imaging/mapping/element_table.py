@@ -81,6 +81,19 @@ class Pixels(NamedTuple):
     """Of the image's grid [mm]."""
 
 
+class Band(NamedTuple):
+    """Some rows of an image while they are filled."""
+
+    elements: ElementTable
+    fields: FloatArray
+    """(m, c, 9) polynomials over the elements; of none (c = 0) the local coordinates are found."""
+    pixels: Pixels
+    state: NDArray[np.uint8]
+    """Of the pixels of these rows: UNASSIGNED, ..."""
+    begin: int
+    """Where these begin among ``pixels``."""
+
+
 def tabulate_elements(
     nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid
 ) -> ElementTable:
@@ -113,7 +126,7 @@ def _enlarged_slopes(reference: ReferenceElement, beyond: float) -> FloatArray:
     return np.asarray(control.reshape(9, -1))
 
 
-@compiled()
+@compiled(relaxed=True)
 def _tabulate(
     elements: ElementTable,
     nodes: FloatArray,
@@ -124,64 +137,37 @@ def _tabulate(
     thread: int,
     threads: int,
 ) -> None:
+    """Fill in the elements: centres, polynomials, sides, and the image rows they reach into."""
     for e in range(thread, len(cells), threads):
-        _tabulate_element(elements, e, nodes, position_px, cells[e], coefficients, rows)
-
-
-@compiled(relaxed=True)
-def _tabulate_element(
-    elements: ElementTable,
-    e: int,
-    nodes: FloatArray,
-    position_px: FloatArray,
-    cell: IntArray,
-    coefficients: FloatArray,
-    rows: int,
-) -> None:
-    """Fill in what belongs to element ``e`` with the nodes ``cell``."""
-    for i in range(2):
-        mean = 0.0
-        for a in cell:
-            mean += position_px[a, i]
-        elements.centres[e, i] = np.rint(mean / cell.size)
-    _combine(elements, e, nodes, position_px, cell, coefficients)
-    low, high, bent = np.inf, -np.inf, 0.0
-    for side in range(elements.sides.shape[1]):
-        _side(elements, e, side, position_px, cell)
-        c = elements.sides[e, side, 0]
-        low = min(low, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
-        high = max(high, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
-    for i in range(2):
-        for m in range(3, 9):
-            bent += abs(elements.polynomials[e, i, m])
-    elements.affine[e] = bent <= _AFFINE_PX
-    elements.row_from[e] = min(max(int(np.ceil(low - 1e-9 + elements.centres[e, 0])), 0), rows)
-    last = int(np.floor(high + 1e-9 + elements.centres[e, 0]))
-    elements.row_to[e] = min(max(last + 1, 0), rows)
-
-
-@compiled(relaxed=True)
-def _combine(
-    elements: ElementTable,
-    e: int,
-    nodes: FloatArray,
-    position_px: FloatArray,
-    cell: IntArray,
-    coefficients: FloatArray,
-) -> None:
-    """Polynomials from nodes, in pixels and in millimetres."""
-    elements.polynomials[e] = 0.0
-    elements.absolute[e] = 0.0
-    for a in range(cell.size):
-        x, y = nodes[cell[a]]
-        row = position_px[cell[a], 0] - elements.centres[e, 0]
-        col = position_px[cell[a], 1] - elements.centres[e, 1]
-        for m in range(9):
-            part = coefficients[m, a]
-            elements.polynomials[e, 0, m] += part * row
-            elements.polynomials[e, 1, m] += part * col
-            elements.absolute[e, 0, m] += part * x
-            elements.absolute[e, 1, m] += part * y
+        cell, centre = cells[e], elements.centres[e]
+        for i in range(2):
+            mean = 0.0
+            for a in cell:
+                mean += position_px[a, i]
+            centre[i] = np.rint(mean / cell.size)
+        elements.polynomials[e] = 0.0
+        elements.absolute[e] = 0.0
+        for a in range(cell.size):
+            x, y = nodes[cell[a]]
+            row, col = position_px[cell[a], 0] - centre[0], position_px[cell[a], 1] - centre[1]
+            for m in range(9):
+                part = coefficients[m, a]
+                elements.polynomials[e, 0, m] += part * row
+                elements.polynomials[e, 1, m] += part * col
+                elements.absolute[e, 0, m] += part * x
+                elements.absolute[e, 1, m] += part * y
+        low, high, bent = np.inf, -np.inf, 0.0
+        for side in range(elements.sides.shape[1]):
+            _side(elements, e, side, position_px, cell)
+            c = elements.sides[e, side, 0]
+            low = min(low, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
+            high = max(high, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
+        for i in range(2):
+            for m in range(3, 9):
+                bent += abs(elements.polynomials[e, i, m])
+        elements.affine[e] = bent <= _AFFINE_PX
+        elements.row_from[e] = min(max(int(np.ceil(low - 1e-9 + centre[0])), 0), rows)
+        elements.row_to[e] = min(max(int(np.floor(high + 1e-9 + centre[0])) + 1, 0), rows)
 
 
 @compiled(relaxed=True)

@@ -24,11 +24,12 @@ Coefficients = tuple[float, ...]
 
 ACCEPTED_PX = 1e-10
 ON_EDGE = 1e-9  # pixels this far outside in xi, eta still belong to the element
-_NEWTON_STEPS = 25
 _BATCH_STEPS = 8
+_NEWTON_STEPS = 20
+_SETTLED = 1e-8  # in xi, eta: Newton's error is squared by a step, so this one left rounding
+_RUNAWAY = 10.0  # in xi, eta: no root inside is reached from so far outside
 _NEARLY_PX = 1e-7  # so near, the next step ends at rounding: convergence is quadratic
 _DEEPEST = 9  # quarters of quarters in the exhaustive search
-_ROUNDING_PX = 1e-13
 
 
 @compiled(inline=True)
@@ -60,6 +61,15 @@ def value_and_slopes(
         p_s += t * (2.0 * s * a[6] + t * a[7] + 2.0 * st * a[8])
         p_t += s * (s * a[6] + 2.0 * t * a[7] + 2.0 * st * a[8])
     return p, p_s, p_t
+
+
+@compiled(inline=True, relaxed=True)
+def distance_px(
+    x: Coefficients, y: Coefficients, curved: bool, s: float, t: float, at: tuple[float, ...]
+) -> float:
+    """Distance of the mapped (s, t) from a pixel in the physical plane; ``at``: x, y, size [mm]."""
+    right, down = at[0] - value(x, curved, s, t), at[1] - value(y, curved, s, t)
+    return float(np.sqrt(down * down + right * right) / at[2])
 
 
 @compiled(inline=True)
@@ -113,33 +123,24 @@ def _step(
 
 
 @compiled()
-def _newton(
+def newton(
     a: Coefficients, b: Coefficients, curved: bool, row: float, col: float, s: float, t: float
 ) -> tuple[bool, float, float]:
-    """Solve position(s, t) = (row, col) from a start; (converged, s, t)."""
-    before = np.inf
+    """Solve position(s, t) = (row, col) for one pixel from a start; (converged, s, t)."""
     for _ in range(_NEWTON_STEPS):
         p, p_s, p_t = value_and_slopes(a, curved, s, t)
         q, q_s, q_t = value_and_slopes(b, curved, s, t)
-        p -= row
-        q -= col
-        residual = p * p + q * q
-        if residual <= _ROUNDING_PX**2 or (
-            residual <= ACCEPTED_PX**2 and residual >= 0.25 * before
-        ):
-            return True, s, t
-        before = residual
         determinant = p_s * q_t - p_t * q_s
         if determinant == 0.0:
             return False, s, t
-        ds = (p_t * q - q_t * p) / determinant
-        dt = (q_s * p - p_s * q) / determinant
-        longest = max(abs(ds), abs(dt))
-        if longest > 2.0:  # a leap this long is no use of a local model
-            ds *= 2.0 / longest
-            dt *= 2.0 / longest
+        ds = (p_t * (q - col) - q_t * (p - row)) / determinant
+        dt = (q_s * (p - row) - p_s * (q - col)) / determinant
         s += ds
         t += dt
+        if max(abs(ds), abs(dt)) < _SETTLED:
+            return True, s, t
+        if max(abs(s), abs(t)) > _RUNAWAY:
+            return False, s, t
     return False, s, t
 
 
@@ -196,7 +197,7 @@ def search(
         if not _may_hold(polynomial, bezier, s0, t0, scale, row, col):
             continue
         middle = scale / 3.0 if triangular else 0.0
-        converged, s, t = _newton(a, b, not triangular, row, col, s0 + middle, t0 + middle)
+        converged, s, t = newton(a, b, not triangular, row, col, s0 + middle, t0 + middle)
         if converged and outside(triangular, s, t) <= ON_EDGE:
             return True, s, t
         if depth < _DEEPEST:

@@ -35,12 +35,11 @@ from modeharvest.imaging.mapping.elements import (
 )
 from modeharvest.imaging.mapping.inversion import (
     ON_EDGE,
-    Coefficients,
     coefficients,
+    distance_px,
+    newton,
     outside,
     search,
-    value,
-    value_and_slopes,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled, in_parallel
@@ -132,9 +131,6 @@ def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArr
 
 _BUCKET_PX = 16
 _BLOCK = 1024  # points that one thread takes at a time
-_STEPS = 20
-_SETTLED = 1e-8  # in xi, eta: Newton's error is squared by a step, so this one left rounding
-_RUNAWAY = 10.0  # in xi, eta: no root inside is reached from so far outside
 _SLACK_PX = 1e-7
 
 
@@ -211,12 +207,15 @@ def _locate(
     threads: int,
 ) -> None:
     """Fill owner, xi and residual; a thread writes its own points only."""
+    x0, y0, h = frame
     for block in range(thread, (row.size + _BLOCK - 1) // _BLOCK, threads):
         for k in range(block * _BLOCK, min((block + 1) * _BLOCK, row.size)):
             e, s, t = _owner(elements, buckets, row[k], col[k])
             owner[k], xi[k, 0], xi[k, 1], residual[k] = e, s, t, np.nan
             if e >= 0:
-                residual[k] = _residual(elements, e, s, t, row[k], col[k], frame)
+                x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
+                at = x0 + h * col[k], y0 - h * row[k], h
+                residual[k] = distance_px(x, y, not elements.triangular, s, t, at)
 
 
 @compiled()
@@ -243,48 +242,7 @@ def _owner(
                 )
             else:
                 a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
-                found, s, t = _newton(a, b, not triangular, down, right, middle)
+                found, s, t = newton(a, b, not triangular, down, right, middle, middle)
             if found and outside(triangular, s, t) <= ON_EDGE:
                 return e, s, t
     return -1, np.nan, np.nan
-
-
-@compiled()
-def _newton(
-    a: Coefficients, b: Coefficients, curved: bool, row: float, col: float, middle: float
-) -> tuple[bool, float, float]:
-    """Solve position(s, t) = (row, col) from the middle; (converged, s, t)."""
-    s = t = middle
-    for _ in range(_STEPS):
-        p, p_s, p_t = value_and_slopes(a, curved, s, t)
-        q, q_s, q_t = value_and_slopes(b, curved, s, t)
-        determinant = p_s * q_t - p_t * q_s
-        if determinant == 0.0:
-            return False, s, t
-        ds = (p_t * (q - col) - q_t * (p - row)) / determinant
-        dt = (q_s * (p - row) - p_s * (q - col)) / determinant
-        s += ds
-        t += dt
-        if max(abs(ds), abs(dt)) < _SETTLED:
-            return True, s, t
-        if max(abs(s), abs(t)) > _RUNAWAY:
-            return False, s, t
-    return False, s, t
-
-
-@compiled(inline=True)
-def _residual(
-    elements: ElementTable,
-    e: int,
-    s: float,
-    t: float,
-    row: float,
-    col: float,
-    frame: tuple[float, float, float],
-) -> float:
-    """Distance of the mapped (s, t) from the point, in the physical plane [px]."""
-    x0, y0, h = frame
-    x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
-    right = x0 + h * col - value(x, not elements.triangular, s, t)
-    down = y0 - h * row - value(y, not elements.triangular, s, t)
-    return float(np.sqrt(right * right + down * down) / h)
