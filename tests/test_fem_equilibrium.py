@@ -220,7 +220,7 @@ def test_energy_of_a_specimen_converges_with_the_mesh() -> None:
             structure, lambda x: x * [-0.01 * loading.length / loading.half_width, 0]
         )
         found = correct(structure, affine, 0.02)
-        assert found.is_converged
+        assert found is not None
         return structure.energy(found.u)
 
     best = energy(0.05)
@@ -294,8 +294,7 @@ def test_a_correction_from_nearby_needs_the_load_once(monkeypatch: pytest.Monkey
 
 def test_newton_says_when_it_fails() -> None:
     structure = structure_of(CURVED, TwoTermI1())
-    found = correct(structure, structure.zero(), 0.9)
-    assert not found.is_converged
+    assert correct(structure, structure.zero(), 0.9) is None
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import modeharvest
+from modeharvest.fem.bloch import postbuckling
 from modeharvest.fem.bloch.critical import critical_at, first_critical
 from modeharvest.fem.bloch.modes import Branch, ModeSet, read_modes
 from modeharvest.fem.bloch.postbuckling import follow
@@ -22,7 +23,6 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.options import (
-    BranchOptions,
     CriticalSearch,
     MacroLoading,
     equibiaxial,
@@ -184,7 +184,7 @@ def test_the_branch_ends_where_material_would_run_into_itself() -> None:
     assert closed[2] is True
 
 
-def test_what_cannot_be_followed_is_an_outcome() -> None:
+def test_what_cannot_be_followed_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     path, modes = start("flower")
     noise = np.random.default_rng(1).normal(size=modes.shapes.shape)
     lost = follow(path, replace(modes, shapes=noise), (1, 0, 0), [1.2 * modes.load])
@@ -194,7 +194,8 @@ def test_what_cannot_be_followed_is_an_outcome() -> None:
     assert stiff.outcome.startswith("not followed: the modes are not critical")
     beyond = follow(path, replace(modes, load=3.0), (1, 0, 0), [4.0])
     assert beyond.outcome.startswith("not followed: no equilibrium of the primary path")
-    short = follow(path, modes, (1, 1, 1), [0.1], options=BranchOptions(0.01, 0.01, farthest=0.02))
+    monkeypatch.setattr(postbuckling, "_FARTHEST", 0.02)
+    short = follow(path, modes, (1, 1, 1), [0.1])
     assert "the largest amplitude" in short.outcome
 
 
@@ -207,8 +208,6 @@ def test_what_does_not_fit_is_refused() -> None:
             follow(path, modes, wrong, [0.1])
     with pytest.raises(InputError, match="one finite load or more"):
         follow(path, modes, (1.0,), [])
-    with pytest.raises(InputError, match="0 < first <= longest"):
-        BranchOptions(first=0.0)
 
 
 def test_the_pattern_is_that_of_the_middle_of_a_finite_specimen() -> None:

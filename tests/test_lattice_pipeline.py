@@ -17,6 +17,7 @@ import pytest
 from modeharvest.cli.root import main
 from modeharvest.fem.bloch.dispersion import Dispersion
 from modeharvest.fem.bloch.modes import read_modes
+from modeharvest.fem.lattice.options import CriticalSearch
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.report.lattice import lattice_report
 from modeharvest.report.model import print_report
@@ -27,7 +28,6 @@ from modeharvest.runs.lattice.case import (
     LatticeCase,
     Loading,
     ModesPlan,
-    SearchPlan,
     SquareLattice,
 )
 from modeharvest.runs.lattice.pipeline import LatticeAnalysis
@@ -215,14 +215,14 @@ def coarse(**changes: Any) -> LatticeCase:
         "lattice": SquareLattice(1.0, 0.8696, 0.2),
         "material": TwoTermI1(),
         "loading": Loading("equibiaxial"),
-        "search": SearchPlan(divisions=2),
+        "search": CriticalSearch(divisions=2),
         "dispersion": DispersionPlan(points=8, bands=1, map_divisions=0),
     }
     return LatticeCase(**{**tables, **changes})
 
 
 def test_a_lattice_that_never_buckles_is_an_outcome(tmp_path: Path) -> None:
-    case = coarse(search=SearchPlan(largest=0.005, divisions=2))
+    case = coarse(search=CriticalSearch(largest=0.005, divisions=2))
     summary = run(case, tmp_path)
     assert "stable up to 0.005" in summary["outcome"]
     assert not summary["critical"]["found"]

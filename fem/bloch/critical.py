@@ -23,6 +23,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
+_FIRST_STEP, _TOLERANCE = 1e-3, 1e-10  # of the load: to begin with; of the critical one
 _CANDIDATES = 3  # grid points from which to descend
 _SAME = 1e-3  # phases [rad] that far apart are the same wave
 _DEGENERATE = 1e-5  # of the measure at rest: values that far apart belong to one set
@@ -201,7 +202,7 @@ class _LoadSearch:
 
     def run(self) -> LatticeCritical:
         """Raise the load until a wave is unstable, then find the root."""
-        largest, load, step = self.search.largest, 0.0, self.search.first_step
+        largest, load, step = self.search.largest, 0.0, _FIRST_STEP
         previous = self._at_rest()
         while load < largest:
             self.progress(load, largest, "lattice")
@@ -246,7 +247,7 @@ class _LoadSearch:
             assert known is not None
             return known.value
 
-        load = float(brentq(value, low, high, xtol=self.search.tolerance, rtol=1e-14))
+        load = float(brentq(value, low, high, xtol=_TOLERANCE, rtol=1e-14))
         value(load)
         least, state = self.history[load], self._near(low, load)
         waves = () if least.angle is not None else self._critical_waves(state, least)

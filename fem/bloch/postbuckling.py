@@ -15,14 +15,19 @@ from dataclasses import replace
 import numpy as np
 
 from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
-from modeharvest.fem.lattice.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
-from modeharvest.fem.lattice.options import CENTRE, BranchOptions
+from modeharvest.fem.lattice.cell import Amplitude, CellPath, CellState, PeriodicCell
+from modeharvest.fem.lattice.options import CENTRE
 from modeharvest.fem.lattice.periodicity import overlaps
 from modeharvest.fem.path.continuation import BranchPoint, amplitude_at, load_at, value_at
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
+# Shares of the primitive cell's shorter vector: first and largest step of the amplitude, the rms
+# displacement in the mode, and where to stop. At small amplitudes the directions of a degenerate
+# set are all but equivalent.
+_FIRST, _LONGEST, _FARTHEST = 0.01, 0.02, 0.4
+_GROWTH = 1.6  # of the step from one point to the next
 _BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
 _CRITICAL = 1e-3  # of the eigenvalues' scale: what a critical mode may have
 _NEAR = 0.5  # of a step: how far from where it is expected a point may be
@@ -34,7 +39,6 @@ def follow(
     modes: ModeSet,
     combination: Sequence[float],
     loads: Sequence[float],
-    options: BranchOptions | None = None,
     progress: Progress = silent,
 ) -> Branch:
     """Follow the branch that starts along a combination of critical modes.
@@ -51,18 +55,16 @@ def follow(
     """
     _check(path.cell, modes, combination, loads)
     mix = np.asarray(combination, dtype=np.float64)
-    tracing = _Tracing(path, modes, mix / np.linalg.norm(mix), options or BranchOptions())
+    tracing = _Tracing(path, modes, mix / np.linalg.norm(mix))
     return tracing.run(sorted(loads), progress)
 
 
 class _Tracing:
     """One branch of one cell; ``points`` are those passed, ``stopped`` is why there are no more."""
 
-    def __init__(
-        self, path: CellPath, modes: ModeSet, mix: FloatArray, options: BranchOptions
-    ) -> None:
+    def __init__(self, path: CellPath, modes: ModeSet, mix: FloatArray) -> None:
         self.cell, self.loading = path.cell, path.loading
-        self.modes, self.mix, self.options = modes, mix, options
+        self.modes, self.mix = modes, mix
         self.pitch = float(np.linalg.norm(modes.primitive, axis=1).min())
         reduction, mass = self.cell.reduction, self.cell.nodal_mass
         shapes, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
@@ -113,12 +115,12 @@ class _Tracing:
         if start is None:
             return
         self.points.append(start)
-        options, step = self.options, self.options.first * self.pitch
-        while self.points[-1].amplitude + step <= options.farthest * self.pitch:
+        step = _FIRST * self.pitch
+        while self.points[-1].amplitude + step <= _FARTHEST * self.pitch:
             found = self._at_amplitude(self.points[-2:], self.points[-1].amplitude + step)
             if isinstance(found, str):
                 step *= 0.5
-                if step < 0.05 * options.first * self.pitch:
+                if step < 0.05 * _FIRST * self.pitch:
                     self.stopped = found
                     return
                 continue
@@ -128,8 +130,8 @@ class _Tracing:
                 self.points[0] = replace(start, rate=rate)
             self.points.append(found)
             yield
-            step = min(options.growth * step, options.longest * self.pitch)
-        self.stopped = f"the largest amplitude asked for is {options.farthest} of the pitch"
+            step = min(_GROWTH * step, _LONGEST * self.pitch)
+        self.stopped = f"the largest amplitude asked for is {_FARTHEST} of the pitch"
 
     def _start(self) -> BranchPoint | None:
         """The critical point, extrapolated from where the tangent is regular, and the mode."""
@@ -161,8 +163,8 @@ class _Tracing:
         weights, guess = self.mix @ self.weights, value_at(points, amplitude)
         prescribed = Amplitude(weights, amplitude + float(weights @ self.origin))
         found = self._corrected(load_at(points, amplitude), guess, prescribed)
-        if isinstance(found, Failure):
-            return found.value
+        if isinstance(found, str):
+            return found
         if self._overlaps(found):
             return "the material would run into itself (contact is not modelled)"
         off = found.fluctuation - guess[4:]
@@ -175,7 +177,7 @@ class _Tracing:
 
     def _corrected(
         self, load: float, guess: FloatArray, amplitude: Amplitude | None = None
-    ) -> CellState | Failure:
+    ) -> CellState | str:
         F, w = guess[:4].reshape(2, 2), guess[4:]
         return self.cell.corrected(self.loading, load, F, w, amplitude)
 

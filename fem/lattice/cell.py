@@ -11,7 +11,6 @@ prescribed it is regular on a branch however near to the point where it leaves t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -163,13 +162,8 @@ class LinearisedCell:
 
 _ITERATIONS = 12
 _SMALLEST_STEP = 1e-6  # of the load
-
-
-class Failure(Enum):
-    """Why there is no equilibrium, as a sentence."""
-
-    NOT_CONVERGED = "Newton's method did not converge"
-    REVERSED = "an element would be turned inside out (det F <= 0)"
+_NOT_CONVERGED = "Newton's method did not converge"
+_REVERSED = "an element would be turned inside out (det F <= 0)"
 
 
 class PeriodicCell:
@@ -217,24 +211,27 @@ class PeriodicCell:
         gradient: FloatArray,
         fluctuation: FloatArray,
         amplitude: Amplitude | None = None,
-    ) -> CellState | Failure:
-        """The equilibrium near a guess of F̄ (2, 2), w and, with an amplitude, the load."""
+    ) -> CellState | str:
+        """The equilibrium near a guess of F̄ (2, 2), w and, with an amplitude, the load.
+
+        Where there is none, the reason.
+        """
         F: FloatArray = gradient.ravel()
         w = fluctuation
         for _ in range(_ITERATIONS):
             F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
             system = LinearisedCell(self, loading, load, F, w, amplitude)
             if not system.is_regular:
-                return Failure.NOT_CONVERGED
+                return _NOT_CONVERGED
             if system.is_solved:
                 is_sound = self.body.smallest_jacobian(self.displaced(F, w)) > 0
-                return system.state() if is_sound else Failure.REVERSED
+                return system.state() if is_sound else _REVERSED
             try:
                 change, dF, dw = system.step()
             except np.linalg.LinAlgError:  # exactly singular
-                return Failure.NOT_CONVERGED
+                return _NOT_CONVERGED
             load, F, w = load + change, F + dF, w + dw
-        return Failure.NOT_CONVERGED
+        return _NOT_CONVERGED
 
     def negative_eigenvalues(self, loading: MacroLoading, state: CellState) -> int:
         """Number of negative eigenvalues of the tangent in w and the free components of F̄.

@@ -1,62 +1,39 @@
-"""Options of a lattice's analysis: macroscopic loading, search of the critical point, branches.
+"""Options of a lattice's analysis: macroscopic loading, search of the critical point, waves.
 
 Plain dataclasses, checked where they are built; neither dolfinx nor gmsh is needed for them.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from modeharvest.fem.experiment import SMALLEST_STEP
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 
 
 @dataclass(frozen=True)
 class CriticalSearch:
-    """How the first critical point is looked for."""
+    """How the first critical point is looked for; loads [-]."""
 
     largest: float = 0.3
-    """Load up to which to look [-]."""
+    """Load up to which to look."""
     divisions: int = 8
     """Of each axis of the zone; an even number has the points M and X on the grid."""
-    first_step: float = 1e-3
     largest_step: float = 0.02
-    """Steps of the load [-]."""
-    tolerance: float = 1e-10
-    """To which the critical load is located [-]."""
+    """Of the load."""
 
     def __post_init__(self) -> None:
-        lengths = (self.largest, self.first_step, self.largest_step, self.tolerance)
-        if not all(0 < length < math.inf for length in lengths) or self.divisions < 2:
+        if not (0 < self.largest < 1 and self.largest_step >= SMALLEST_STEP):
             raise InputError(
-                "search for a critical point: expected positive loads, steps and tolerance and at "
-                f"least 2 divisions, got {self}"
+                f"search: expected 0 < largest < 1 and steps of {SMALLEST_STEP:g} or more, got "
+                f"{self}"
             )
-
-
-@dataclass(frozen=True)
-class BranchOptions:
-    """How a branch is followed; lengths are shares of the primitive cell's shorter vector."""
-
-    # At small amplitudes the directions of a degenerate set are all but equivalent.
-    first: float = 0.01
-    longest: float = 0.02
-    """First and largest step of the amplitude, the rms displacement in the mode [-]."""
-    growth: float = 1.6
-    """Of the step from one point to the next [-]."""
-    farthest: float = 0.4
-    """Amplitude where to stop [-]."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.first <= self.longest <= self.farthest < math.inf or self.growth < 1:
-            raise InputError(
-                f"branch: expected 0 < first <= longest <= farthest and growth >= 1, got {self}"
-            )
+        require_within("search: expected divisions", self.divisions, 2, 200)
 
 
 Wave = tuple[float, float]

@@ -136,7 +136,7 @@ class PathFollower:
         None if Newton does not get there, or gets to a state with a reversed element.
         """
         found = correct(self.structure, guess, strain, self.linearisation, constraint)
-        if not found.is_converged or self.structure.smallest_jacobian(found.u) <= 0.0:
+        if found is None or self.structure.smallest_jacobian(found.u) <= 0.0:
             self.linearisation = None  # it may be that of a wrong state
             return None
         return self._settle(found.u, found.strain, found.load, with_modes)

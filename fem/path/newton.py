@@ -47,40 +47,32 @@ class Linearisation:
     """Norm of ``Structure.load`` [N/mm]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """Where Newton's method arrived, and whether that is an equilibrium; if it is, its load."""
-
-    u: PETSc.Vec
-    strain: float
-    load: PETSc.Vec | None
-    is_converged: bool
-
-
 def correct(
     structure: Structure,
     guess: PETSc.Vec,
     strain: float,
     near: Linearisation | None = None,
     constraint: Constraint | None = None,
-) -> Correction:
-    """Find the equilibrium near ``guess``.
+) -> NewtonIteration | None:
+    """The iteration that has arrived at the equilibrium near ``guess``; None if none arrives.
 
     The guess is left as it is; its constrained components are set from ``strain``, the nominal one
     that is prescribed or, with a constraint, its own start. ``near`` is that of a state nearby.
     """
-    iterate = _Iterate(structure, guess, strain, near, constraint)
-    is_converged = False
+    iteration = NewtonIteration(structure, guess, strain, near, constraint)
     for _ in range(_MAX_ITERATIONS):
-        iterate.evaluate()
-        is_converged = iterate.is_solved
-        if is_converged or not iterate.advance():
+        iteration.evaluate()
+        if iteration.is_solved:
+            return iteration
+        if not iteration.advance():
             break
-    return Correction(iterate.u, iterate.strain, iterate.load, is_converged)
+    return None
 
 
-class _Iterate:
-    """A Newton iteration under way: where it is, and the step that led there.
+class NewtonIteration:
+    """A Newton iteration under way: where it is (``u``, ``strain``), and the step that led there.
+
+    ``load`` is that of ``u`` when the iteration has arrived.
 
     A step is assessed by the next one that the same factor would make from there, which is
     a measure of the error in millimetres (natural monotonicity: Deuflhard, Newton Methods for

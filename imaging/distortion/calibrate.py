@@ -39,6 +39,12 @@ from modeharvest.util.progress import Progress, silent
 _COARSE_PX = 512
 """Size to which photographs are binned to find their shifts within some px."""
 _COARSE_DEGREE = 3
+*_COARSE_BLURS_PX, _BLUR_PX = 12.0, 6.0, 3.0, 0.7
+"""Of the photographs. The first bridges what the binned correlation and S leave; the last makes the
+spline's noise independent of where between pixels it samples, which would else draw S towards half
+pixels."""
+_ORDER = 5
+"""Of the spline that samples the photographs."""
 _BORDER_PX = 4.0
 _MATCH = 0.5
 """Photographs that correlate less with the others show something else."""
@@ -54,23 +60,14 @@ class CalibrationOptions:
     """Total degrees of S to compare, ascending, from 2 on, until the criterion rises two times."""
     rotations: bool = True
     """Whether the target may turn a little in photographs whose shifts are not known."""
-    blurs_px: tuple[float, ...] = (12.0, 6.0, 3.0, 0.7)
-    """Blurs of the photographs, from coarse to fine [px]. The first bridges what the binned
-    correlation and S leave; the last makes the spline's noise independent of where between pixels
-    it samples, which would else draw S towards half pixels."""
     points: int = 100_000
     """About how many points of the target to look at; more lower the standard deviation."""
-    order: int = 5
-    """Of the spline that samples the photographs: 5 or 3."""
 
     def __post_init__(self) -> None:
         if not self.degrees or self.degrees[0] < 2 or list(self.degrees) != sorted(self.degrees):
             raise InputError(f"expected ascending degrees from 2 on, got {self.degrees}")
-        if len(self.blurs_px) < 2 or min(self.blurs_px) < 0.0 or self.points < 1000:
-            raise InputError(
-                "expected two or more blurs of 0 px or more and at least 1000 points, got "
-                f"{self.blurs_px} and {self.points}"
-            )
+        if self.points < 1000:
+            raise InputError(f"expected at least 1000 points, got {self.points}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +176,7 @@ def calibrate(
     known = shifts is not None
     start = _given(shifts, len(images)) if known else _rough_shifts(photographs)
     free = (not known, not known, not known and options.rotations)
-    steps, done = len(options.blurs_px) + len(options.degrees), itertools.count(1)
+    steps, done = len(_COARSE_BLURS_PX) + 1 + len(options.degrees), itertools.count(1)
 
     def report() -> None:
         progress(next(done), steps, "calibrate")
@@ -191,7 +188,7 @@ def calibrate(
     trials, stride = _trials(photographs, coarse, fit, free, options, report)
     _require_matches(min(trials, key=lambda trial: trial[1].bic)[1])
     progress(1, 1, "calibrate")
-    return calibration_of(trials, sampled_noise(options.blurs_px[-1], options.order, stride))
+    return calibration_of(trials, sampled_noise(_BLUR_PX, _ORDER, stride))
 
 
 def _coarse_fit(
@@ -206,9 +203,9 @@ def _coarse_fit(
     degree = min(_COARSE_DEGREE, options.degrees[-1])
     model = PolynomialModel((rows, cols), degree, fixed=3 if moving[0] else 1)
     c = model.start
-    for blur in options.blurs_px[:-1]:
+    for blur in _COARSE_BLURS_PX:
         # Where they don't match yet, a fit of the light would sooner wipe out the contrast.
-        views = _views(photographs, poses, (*moving, False, False), blur, options.order)
+        views = _views(photographs, poses, (*moving, False, False), blur)
         points, _ = _points((rows, cols), poses, options.points // 4)
         fit = fit_views(model, c, views, points, tolerance_px=0.02, max_iterations=10)
         c, poses = fit.coefficients, fit.poses
@@ -226,7 +223,7 @@ def _trials(
 ) -> tuple[list[tuple[PolynomialModel, Fit]], float]:
     """One fit a degree, the best one to the end; and the stride of the points [px]."""
     free = (*moving, True, True)
-    views = _views(photographs, fit.poses, free, options.blurs_px[-1], options.order)
+    views = _views(photographs, fit.poses, free, _BLUR_PX)
     points, stride = _points(model.shape, fit.poses, options.points)
     trials: list[tuple[PolynomialModel, Fit]] = []
     c = fit.coefficients
@@ -277,12 +274,11 @@ def _views(
     poses: Sequence[Pose],
     free: tuple[bool, ...],
     blur: float,
-    order: int,
 ) -> list[View]:
     """Photographs as splines; the first one stays where it is."""
     return [
         View(
-            blurred_spline(image, blur, order),
+            blurred_spline(image, blur, _ORDER),
             pose,
             free if n else (False,) * POSE_UNKNOWNS,
             border_px=max(_BORDER_PX, blur),

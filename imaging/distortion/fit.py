@@ -211,11 +211,6 @@ class Fit:
     """Degrees of freedom of that."""
     matches: FloatArray
     """(views,) correlation of each photograph with the mean of the others [-]."""
-    iterations: int
-    converged: bool
-    """Whether the last step was short enough."""
-    condition_number: float
-    """Of the normal matrix, scaled to a unit diagonal."""
 
     @property
     def variance(self) -> float:
@@ -243,34 +238,28 @@ def fit_views(
     points : (n,) rows and columns of ideal positions to look at [px].
     tolerance_px : largest change of S or of a shift [px] at which to stop.
     """
-    poses = [view.pose for view in views]
     free = np.array([view.free for view in views])
     half_size = 0.5 * max(views[0].spline.shape)
     px = np.array([1.0, 1.0, half_size, 0.0, 0.0])
-    iterations = 0
-    while iterations < max_iterations:
-        iterations += 1
-        matrix, gradient, squares, freedom, matches = _assemble(model, c, views, poses, points)
+    for _ in range(max_iterations):
+        matrix, gradient, squares, freedom, matches = _assemble(model, c, views, points)
         eigen = ScaledEigen.of(matrix)
         step = -eigen.solve(gradient)
         own = np.zeros(free.shape)
         own[free] = step[len(c) :]
         c = c + step[: len(c)]
-        poses = [pose.stepped(change) for pose, change in zip(poses, own, strict=True)]
+        views = with_poses(views, [v.pose.stepped(s) for v, s in zip(views, own, strict=True)])
         length = max(np.abs(step[: len(c)]).max(), np.abs(own * px).max())
         if length < tolerance_px:
             break
     return Fit(
         coefficients=c,
-        poses=tuple(poses),
+        poses=tuple(view.pose for view in views),
         inverse=eigen.inverse(),
         free=free,
         sum_of_squares=squares,
         freedom=max(1, freedom - len(step)),
         matches=matches,
-        iterations=iterations,
-        converged=bool(length < tolerance_px),
-        condition_number=eigen.condition_number,
     )
 
 
@@ -278,7 +267,6 @@ def _assemble(
     model: PolynomialModel,
     c: FloatArray,
     views: Sequence[View],
-    poses: Sequence[Pose],
     points: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, float, int, FloatArray]:
     """Normal equations of the scatter about the mean, chunk by chunk: matrix and gradient.
@@ -294,10 +282,7 @@ def _assemble(
     distortion = model.distortion(c)
     for first in range(0, points[0].size, _CHUNK):
         row, col = (a[first : first + _CHUNK] for a in points)
-        samples = [
-            _sample(model, c, distortion, view, pose, row, col)
-            for view, pose in zip(views, poses, strict=True)
-        ]
+        samples = [_sample(model, c, distortion, view, row, col) for view in views]
         count = np.sum([inside for inside, _, _ in samples], axis=0)
         weight = 1.0 / np.maximum(count, 1)
         mean = weight * np.sum([value for _, value, _ in samples], axis=0)
@@ -322,12 +307,11 @@ def _sample(
     c: FloatArray,
     distortion: Distortion,
     view: View,
-    pose: Pose,
     row: FloatArray,
     col: FloatArray,
 ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
     """Where a view shows the points; grey levels and their derivatives, 0 elsewhere."""
-    rows, cols = view.spline.shape
+    (rows, cols), pose = view.spline.shape, view.pose
     arm_row, arm_col = row - 0.5 * (rows - 1), col - 0.5 * (cols - 1)
     cos, sin = np.cos(pose.angle), np.sin(pose.angle)
     at_row = 0.5 * (rows - 1) + cos * arm_row - sin * arm_col + pose.shift[0]

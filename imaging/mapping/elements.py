@@ -210,7 +210,7 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
     return unproved[bad]
 
 
-@compiled()
+@compiled(relaxed=True)
 def _prove(
     positions: FloatArray,
     cells: IntArray,
@@ -226,31 +226,20 @@ def _prove(
     ``slopes`` (2, q, k): derivatives of the shape functions at the lattice's points.
     """
     for e in range(thread, len(cells), threads):
-        proved[e] = _prove_one(positions, cells[e], slopes, convert, coefficients[e])
-
-
-@compiled(relaxed=True)
-def _prove_one(
-    positions: FloatArray,
-    cell: IntArray,
-    slopes: FloatArray,
-    convert: FloatArray,
-    coefficients: FloatArray,
-) -> bool:
-    coefficients[:] = 0.0
-    for q in range(slopes.shape[1]):
-        x_s, x_t, y_s, y_t = 0.0, 0.0, 0.0, 0.0
-        for a in range(cell.size):
-            x, y = positions[cell[a], 0], positions[cell[a], 1]
-            x_s += slopes[0, q, a] * x
-            x_t += slopes[1, q, a] * x
-            y_s += slopes[0, q, a] * y
-            y_t += slopes[1, q, a] * y
-        determinant = x_s * y_t - x_t * y_s
-        for p in range(coefficients.size):
-            coefficients[p] += convert[p, q] * determinant
-    size = np.abs(coefficients).max()
-    return bool(np.all(coefficients > _ROUNDING * size))  # False for NaN
+        found = coefficients[e]
+        found[:] = 0.0
+        for q in range(slopes.shape[1]):
+            x_s, x_t, y_s, y_t = 0.0, 0.0, 0.0, 0.0
+            for a in range(cells.shape[1]):
+                x, y = positions[cells[e, a], 0], positions[cells[e, a], 1]
+                x_s += slopes[0, q, a] * x
+                x_t += slopes[1, q, a] * x
+                y_s += slopes[0, q, a] * y
+                y_t += slopes[1, q, a] * y
+            determinant = x_s * y_t - x_t * y_s
+            for p in range(found.size):
+                found[p] += convert[p, q] * determinant
+        proved[e] = np.all(found > _ROUNDING * np.abs(found).max())  # False for NaN
 
 
 def require_positive_jacobian(

@@ -26,9 +26,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, runti
 from pydantic import model_validator
 
 from modeharvest.fem.bloch.dispersion import ZONES
-from modeharvest.fem.experiment import SMALLEST_STEP
 from modeharvest.fem.lattice import options
-from modeharvest.fem.lattice.options import Wave
+from modeharvest.fem.lattice.options import CriticalSearch, Wave
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
 from modeharvest.util.errors import InputError, require_within
@@ -227,23 +226,6 @@ def _rate(component: Component) -> float | None:
 
 
 @dataclass(frozen=True)
-class SearchPlan:
-    """Where :class:`modeharvest.fem.lattice.options.CriticalSearch` looks; loads [-]."""
-
-    largest: float = 0.3
-    divisions: int = 8
-    largest_step: float = 0.02
-
-    def __post_init__(self) -> None:
-        if not (0 < self.largest < 1 and self.largest_step >= SMALLEST_STEP):
-            raise InputError(
-                f"search: expected 0 < largest < 1 and steps of {SMALLEST_STEP:g} or more, got "
-                f"{self}"
-            )
-        require_within("search: expected divisions", self.divisions, 2, 200)
-
-
-@dataclass(frozen=True)
 class DispersionPlan:
     """Where the lowest eigenvalues are computed."""
 
@@ -336,7 +318,7 @@ class LatticeCase(CaseModel):
     lattice: Annotated[LatticeSpec, of_kind(LATTICES, "lattice")] = SquareLattice()
     material: Annotated[Material, of_kind(MATERIALS, "material")] = Ogden()
     loading: Loading = Loading()
-    search: SearchPlan = SearchPlan()
+    search: CriticalSearch = CriticalSearch()
     dispersion: DispersionPlan = DispersionPlan()
     modes: ModesPlan = ModesPlan()
     study: StudyPlan | None = None

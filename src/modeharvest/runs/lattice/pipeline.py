@@ -56,10 +56,9 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         def work() -> tuple[Path, ...]:
             primary = self._path()
             from modeharvest.fem.bloch.critical import first_critical
-            from modeharvest.fem.lattice.options import CriticalSearch
 
-            search = CriticalSearch(**asdict(self.case.search))
-            found = first_critical(primary, search, named(self.progress, "first critical load"))
+            progress = named(self.progress, "first critical load")
+            found = first_critical(primary, self.case.search, progress)
             point = CriticalPoint.of(self.case.loading.name, found)
             write_json(path, to_plain({"point": point, "history": found.history}))
             return (path,)
