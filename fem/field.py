@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import meshio
@@ -26,6 +26,8 @@ from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
 from modeharvest.util.typed import made
+
+T = TypeVar("T")
 
 FORMAT = "modeharvest-solution-1"
 COMPRESSED = {"compression": 6, "shuffle": True}
@@ -158,13 +160,9 @@ class Solution:
             file.attrs["info"] = json.dumps(dict(self.info))
             write_mesh(file, self.mesh)
             for k, s in enumerate(self.snapshots):
+                pivots = -1 if s.negative_pivots is None else s.negative_pivots
                 group = file.create_group(f"snapshots/{k:04d}")
-                group.create_dataset("displacement", data=s.displacement, **COMPRESSED)
-                for name in ("nominal_strain", "reaction", "energy", "branch"):
-                    group.attrs[name] = getattr(s, name)
-                pivots = s.negative_pivots
-                group.attrs["negative_pivots"] = -1 if pivots is None else pivots
-                group.attrs["eigenvalues"] = np.asarray(s.eigenvalues, dtype=np.float64)
+                write_values(group, replace(s, negative_pivots=pivots))
 
     @classmethod
     def read(cls, path: Path | str) -> Solution:
@@ -206,17 +204,28 @@ def read_mesh(file: h5py.File) -> Mesh:
     return Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
 
 
+def write_values(group: h5py.Group, record: Any) -> None:
+    """Into an HDF5 group: a dataclass' arrays as datasets, all else as attributes."""
+    for name, value in vars(record).items():
+        if isinstance(value, np.ndarray):
+            group.create_dataset(name, data=value, **COMPRESSED)
+        else:
+            group.attrs[name] = value
+
+
+def read_values(group: h5py.Group, kind: type[T]) -> T:
+    """What :func:`write_values` wrote of a dataclass."""
+    found: dict[str, Any] = {}
+    for name in (f.name for f in fields(kind)):  # type: ignore[arg-type]
+        is_array = name in group
+        found[name] = group[name][()] if is_array else np.asarray(group.attrs[name]).tolist()
+    return kind(**found)
+
+
 def _read_snapshot(group: h5py.Group) -> Snapshot:
-    pivots = int(group.attrs["negative_pivots"])
-    return Snapshot(
-        nominal_strain=float(group.attrs["nominal_strain"]),
-        displacement=group["displacement"][:],
-        reaction=float(group.attrs["reaction"]),
-        energy=float(group.attrs["energy"]),
-        negative_pivots=None if pivots < 0 else pivots,
-        eigenvalues=tuple(float(v) for v in group.attrs["eigenvalues"]),
-        branch=str(group.attrs["branch"]),
-    )
+    found = read_values(group, Snapshot)
+    pivots = None if found.negative_pivots == -1 else found.negative_pivots
+    return replace(found, negative_pivots=pivots, eigenvalues=tuple(found.eigenvalues))
 
 
 def read_any_mesh(path: Path | str) -> meshio.Mesh:

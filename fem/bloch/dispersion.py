@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from modeharvest.fem.field import read_values, write_values
 from modeharvest.fem.lattice.options import CENTRE, Wave, wave_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from modeharvest.fem.bloch.eigen import BlochWaves
     from modeharvest.fem.lattice.cell import CellPath, CellState
 
-
-Corners = Sequence[tuple[str, Wave]]
 
 _PI = math.pi
 _GAMMA = ("Γ", CENTRE)
@@ -49,7 +48,6 @@ same, the edges X-M and Y-M are all of the boundary."""
 
 
 _ARRAYS = ("waves", "distances", "loads", "eigenvalues")
-_MAP_ARRAYS = ("phases", "eigenvalues", "lattice")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +116,7 @@ class Dispersion:
             for name in _ARRAYS:
                 file[name] = getattr(self, name)
             for k, part in enumerate(self.zone):
-                group = file.create_group(f"zone/{k}")
-                group.attrs["load"] = part.load
-                for name in _MAP_ARRAYS:
-                    group[name] = getattr(part, name)
+                write_values(file.create_group(f"zone/{k}"), part)
 
     @classmethod
     def read(cls, path: Path | str) -> Dispersion:
@@ -129,16 +124,13 @@ class Dispersion:
         with open_hdf5(path, "a dispersion file (HDF5)") as file:
             arrays = {name: file[name][()] for name in _ARRAYS}
             labels, stops = tuple(map(str, file.attrs["labels"])), tuple(map(int, file["stops"]))
-            zone = tuple(
-                ZoneMap(float(group.attrs["load"]), *(group[name][()] for name in _MAP_ARRAYS))
-                for group in file.get("zone", {}).values()
-            )
+            zone = tuple(read_values(group, ZoneMap) for group in file.get("zone", {}).values())
             return cls(labels, stops, **arrays, zone=zone)
 
 
 def dispersion(
     path: CellPath,
-    corners: Corners,
+    corners: Sequence[tuple[str, Wave]],
     loads: Sequence[float],
     count: int = 60,
     bands: int = 3,

@@ -30,7 +30,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from modeharvest.fem.field import COMPRESSED, Mesh, in_space, read_mesh, write_mesh
+from modeharvest.fem.field import (
+    COMPRESSED,
+    Mesh,
+    in_space,
+    read_mesh,
+    read_values,
+    write_mesh,
+    write_values,
+)
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -114,8 +122,6 @@ class Branch:
 
 FORMAT = "modeharvest-modes-1"
 _OF_SET = ("lattice", "primitive", "eigenvalues", "gradient")
-_NUMBERS = ("load", "energy", "primary_energy", "negative_eigenvalues")
-_ARRAYS = ("displacement", "gradient", "stress", "amplitudes")
 
 
 def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
@@ -164,27 +170,17 @@ def _write_branch(group: h5py.Group, branch: Branch) -> None:
     group["combination"] = np.asarray(branch.combination, dtype=np.float64)
     group["curve"] = branch.curve
     for k, state in enumerate(branch.states):
-        place = group.create_group(f"states/{k:04d}")
-        for name in _NUMBERS:
-            place.attrs[name] = getattr(state, name)
-        for name in _ARRAYS:
-            place.create_dataset(name, data=getattr(state, name), **COMPRESSED)
+        write_values(group.create_group(f"states/{k:04d}"), state)
 
 
 def _read_branch(group: h5py.Group, modes: ModeSet) -> Branch:
     groups = group.get("states", {})
-    states = tuple(_read_state(groups[name]) for name in sorted(groups))
+    states = tuple(read_values(groups[name], BranchState) for name in sorted(groups))
     for shape in (state.displacement.shape for state in states):
         if shape != modes.mesh.nodes.shape:
             raise InputError(f"displacements of shape {shape} on {len(modes.mesh.nodes)} nodes")
     combination = tuple(float(c) for c in group["combination"][:])
     return Branch(combination, states, str(group.attrs["outcome"]), group["curve"][:])
-
-
-def _read_state(group: h5py.Group) -> BranchState:
-    values: dict[str, Any] = {name: float(group.attrs[name]) for name in _NUMBERS}
-    values["negative_eigenvalues"] = int(values["negative_eigenvalues"])
-    return BranchState(**values, **{name: group[name][:] for name in _ARRAYS})
 
 
 def _write_meshio(

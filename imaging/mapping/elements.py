@@ -37,8 +37,6 @@ _SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0],
 class ReferenceElement:
     """One element type."""
 
-    name: str
-    """T3, T6, Q4, Q8 or Q9."""
     triangular: bool
     """Whether the reference domain is the triangle (else the square)."""
     nodes: FloatArray
@@ -75,17 +73,17 @@ def monomial_gradients(xi: ArrayLike) -> FloatArray:
     return np.stack([along_xi, along_eta], axis=-1)
 
 
-def _make(name: str, triangular: bool, count: int, spanned: tuple[int, ...]) -> ReferenceElement:
-    nodes = np.array(_TRIANGLE if triangular else _SQUARE, dtype=np.float64)[:count]
-    return ReferenceElement(name, triangular, nodes, spanned)
+def _make(triangular: bool, spanned: tuple[int, ...]) -> ReferenceElement:
+    nodes = np.array(_TRIANGLE if triangular else _SQUARE, dtype=np.float64)[: len(spanned)]
+    return ReferenceElement(triangular, nodes, spanned)
 
 
 _ELEMENTS = {
-    "T3": _make("T3", True, 3, (0, 1, 2)),
-    "T6": _make("T6", True, 6, (0, 1, 2, 3, 4, 5)),
-    "Q4": _make("Q4", False, 4, (0, 1, 2, 4)),
-    "Q8": _make("Q8", False, 8, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "Q9": _make("Q9", False, 9, (0, 1, 2, 3, 4, 5, 6, 7, 8)),
+    "T3": _make(True, (0, 1, 2)),
+    "T6": _make(True, (0, 1, 2, 3, 4, 5)),
+    "Q4": _make(False, (0, 1, 2, 4)),
+    "Q8": _make(False, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "Q9": _make(False, (0, 1, 2, 3, 4, 5, 6, 7, 8)),
 }
 
 
