@@ -193,48 +193,31 @@ def _add(
     thread: int,
     threads: int,
 ) -> None:
-    """``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are."""
+    """Add a weight times the selected pixels' grey levels to ``total``; others get anything.
+
+    ``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are.
+    """
     rows, cols = total.shape
+    where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
+    shown, work = np.empty(BLOCK), workspace()
     for band in range(thread, start.size - 1, threads):
         top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
         if not selected[top:bottom].any():
             continue
-        visited, sums = visits[start[band] : start[band + 1]], total[top:bottom].ravel()
-        grey = _render_pixels(
-            elements, place, pattern, background, selected.ravel(), visited, top, bottom, cols
-        )
-        for k in range(grey.size):  # of others, too: what they get is not looked at
-            sums[k] += weight * grey[k]
-
-
-@compiled()
-def _render_pixels(
-    elements: ElementTable,
-    place: FloatArray,
-    pattern: SplineTable,
-    background: float,
-    selected: BoolArray,
-    visited: IntArray,
-    top: int,
-    bottom: int,
-    cols: int,
-) -> FloatArray:
-    """Grey levels of the pixels of some rows."""
-    size = (bottom - top) * cols
-    element, at, grey = np.empty(size, dtype=np.int32), np.empty((2, size)), np.empty(size)
-    pixels = Pixels(element, at, np.empty(0, dtype=np.float32), top, cols, 0.0, 0.0, 1.0)
-    fill(elements, place, pixels, selected, visited, top, bottom)
-    where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
-    shown, work = np.empty(BLOCK), workspace()
-    grey[:] = background
-    count = 0
-    for k in range(size):
-        if element[k] >= 0:
-            where[count], row[count], col[count] = k, at[0, k], at[1, k]
-            count += 1
-        if count == BLOCK or (k == size - 1 and count > 0):
-            sample(pattern, row[:count], col[:count], shown[:count], work)
-            for n in range(count):
-                grey[where[n]] = shown[n]
-            count = 0
-    return grey
+        sums, size = total[top:bottom].ravel(), (bottom - top) * cols
+        element, at = np.empty(size, dtype=np.int32), np.empty((2, size))
+        pixels = Pixels(element, at, np.empty(0, dtype=np.float32), top, cols, 0.0, 0.0, 1.0)
+        visited = visits[start[band] : start[band + 1]]
+        fill(elements, place, pixels, selected.ravel(), visited, top, bottom)
+        count = 0
+        for k in range(size):
+            if element[k] >= 0:
+                where[count], row[count], col[count] = k, at[0, k], at[1, k]
+                count += 1
+            else:
+                sums[k] += weight * background
+            if count == BLOCK or (k == size - 1 and count > 0):
+                sample(pattern, row[:count], col[:count], shown[:count], work)
+                for n in range(count):
+                    sums[where[n]] += weight * shown[n]
+                count = 0

@@ -92,34 +92,20 @@ def invert(
 ) -> None:
     """Solve position(s, t) = (row, col) for ``count`` pixels from s, t; it may be wrong."""
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
+    curved = not triangular
     for _ in range(_BATCH_STEPS):
-        if _step(a, b, not triangular, row, col, s, t, count) <= _NEARLY_PX**2:
+        total = 0.0  # of squared residuals before the step
+        for k in range(count):
+            p, p_s, p_t = value_and_slopes(a, curved, s[k], t[k])
+            q, q_s, q_t = value_and_slopes(b, curved, s[k], t[k])
+            p -= row[k]
+            q -= col[k]
+            total += p * p + q * q
+            inverse = 1.0 / (p_s * q_t - p_t * q_s)
+            s[k] += (p_t * q - q_t * p) * inverse
+            t[k] += (q_s * p - p_s * q) * inverse
+        if total <= _NEARLY_PX**2:
             break
-
-
-@compiled(relaxed=True)
-def _step(
-    a: Coefficients,
-    b: Coefficients,
-    curved: bool,
-    row: FloatArray,
-    col: FloatArray,
-    s: FloatArray,
-    t: FloatArray,
-    count: int,
-) -> float:
-    """One Newton step for all; the sum of squared residuals before it."""
-    total = 0.0
-    for k in range(count):
-        p, p_s, p_t = value_and_slopes(a, curved, s[k], t[k])
-        q, q_s, q_t = value_and_slopes(b, curved, s[k], t[k])
-        p -= row[k]
-        q -= col[k]
-        total += p * p + q * q
-        inverse = 1.0 / (p_s * q_t - p_t * q_s)
-        s[k] += (p_t * q - q_t * p) * inverse
-        t[k] += (q_s * p - p_s * q) * inverse
-    return total
 
 
 @compiled()
