@@ -18,7 +18,6 @@ from scipy.optimize import least_squares
 from modeharvest.imaging.distortion.calibrate import LensEstimate
 from modeharvest.imaging.distortion.fit import (
     PolynomialModel,
-    Pose,
     View,
     blurred_spline,
     checked_images,
@@ -140,7 +139,7 @@ def recover_camera(
 
 def _views(
     images: Sequence[NDArray[np.float32]],
-    poses: Sequence[Pose],
+    poses: FloatArray,
     blur: float,
     order: int,
     light: bool,

@@ -22,7 +22,6 @@ from modeharvest.imaging.distortion.fit import (
     POSE_UNKNOWNS,
     Fit,
     PolynomialModel,
-    Pose,
     View,
     blurred_spline,
     checked_images,
@@ -193,7 +192,7 @@ def calibrate(
 
 def _coarse_fit(
     photographs: Sequence[FloatImage],
-    poses: Sequence[Pose],
+    poses: FloatArray,
     moving: tuple[bool, bool, bool],
     options: CalibrationOptions,
     report: Callable[[], None],
@@ -271,7 +270,7 @@ def _rough_shifts(photographs: Sequence[FloatImage]) -> FloatArray:
 
 def _views(
     photographs: Sequence[FloatImage],
-    poses: Sequence[Pose],
+    poses: FloatArray,
     free: tuple[bool, ...],
     blur: float,
 ) -> list[View]:
@@ -288,10 +287,10 @@ def _views(
 
 
 def _points(
-    shape: tuple[int, ...], poses: Sequence[Pose], count: int
+    shape: tuple[int, ...], poses: FloatArray, count: int
 ) -> tuple[tuple[FloatArray, FloatArray], float]:
     """Ideal positions on an even grid, about ``count`` a photograph, and its stride [px]."""
-    shifts = np.array([pose.shift for pose in poses])
+    shifts = poses[:, :2]
     low, high = -shifts.max(axis=0) - 20.0, np.array(shape) - shifts.min(axis=0) + 20.0
     stride = max(1.0, float(np.sqrt(np.prod(shape) / count)))
     axes = [np.arange(a, b, stride) for a, b in zip(low, high, strict=True)]
@@ -309,9 +308,9 @@ def _require_matches(fit: Fit) -> None:
         )
 
 
-def _require_shifts(poses: Sequence[Pose]) -> None:
+def _require_shifts(poses: FloatArray) -> None:
     """Raise InputError unless the shifts span the plane: they don't determine S otherwise."""
-    shifts = np.array([pose.shift for pose in poses])
+    shifts = poses[:, :2]
     along, across = np.linalg.svd(shifts, compute_uv=False)
     longest = float(np.hypot(*shifts.T).max())
     if longest < _LEAST_SHIFT or across < _LEAST_BREADTH * along:
@@ -332,9 +331,9 @@ def calibration_of(
     own[fit.free] = np.sqrt(np.diag(covariance)[len(fit.coefficients) :])
     return Calibration(
         **vars(LensEstimate.of(model, fit, noise)),
-        shifts=np.array([pose.shift for pose in fit.poses]),
+        shifts=fit.poses[:, :2],
         shifts_sd=own[:, :2],
-        angles=np.array([pose.angle for pose in fit.poses]),
+        angles=fit.poses[:, 2],
         angles_sd=own[:, 2],
         trials=_tried(trials, noise),
     )

@@ -11,7 +11,7 @@ residual by what becomes of white noise where a blurred image is sampled between
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -75,29 +75,10 @@ class PolynomialModel:
 
 
 POSE_UNKNOWNS = 5
-"""Of a photograph: shift along rows and columns, rotation, contrast, brightness."""
+"""Of a photograph: shift along rows and columns [px], rotation [rad], contrast, brightness.
 
-
-@dataclass(frozen=True)
-class Pose:
-    """Where the target is in a photograph, and how bright that is.
-
-    T(x) = centre + R (x - centre) + shift, a small rotation from the columns' to the rows' axis.
-    """
-
-    shift: tuple[float, float] = (0.0, 0.0)
-    """(row, col) [px]."""
-    angle: float = 0.0
-    """Rotation [rad]."""
-    contrast: float = 1.0
-    brightness: float = 0.0
-    """c and o: c I + o is as bright as the first photograph."""
-
-    def stepped(self, step: FloatArray) -> Pose:
-        """Add the five unknowns' changes."""
-        now = (*self.shift, self.angle, self.contrast, self.brightness)
-        row, col, *others = (float(value) for value in np.add(now, step))
-        return Pose((row, col), *others)
+The target's point x is at T(x) = centre + R (x - centre) + shift, R a small rotation from the
+columns' to the rows' axis; contrast * level + brightness is as bright as the first photograph."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +87,10 @@ class View:
 
     spline: SplineImage
     """Of the photograph."""
-    pose: Pose = field(default_factory=Pose)
-    """Where the target is in it."""
+    pose: FloatArray
+    """(5,) where the target is in it, and how bright that is: see ``POSE_UNKNOWNS``."""
     free: tuple[bool, ...] = (False,) * POSE_UNKNOWNS
-    """(5,) whether shift (2), rotation, contrast and brightness are unknown."""
+    """(5,) which of these are unknown."""
     distorted: bool = True
     """False if the photograph has no distortion, as one of a known pair."""
     border_px: float = 4.0
@@ -134,22 +115,20 @@ def blurred_spline(image: FloatImage, blur_px: float, order: int) -> SplineImage
     return SplineImage.of(ndimage.gaussian_filter(image, blur_px) if blur_px else image, order)
 
 
-def with_poses(views: Sequence[View], poses: Sequence[Pose]) -> list[View]:
-    """The same views, in other poses."""
+def with_poses(views: Sequence[View], poses: FloatArray) -> list[View]:
+    """The same views, in other poses (views, 5)."""
     return [replace(view, pose=pose) for view, pose in zip(views, poses, strict=True)]
 
 
 def normalised_illumination(
     images: Sequence[FloatImage], shifts: FloatArray | None = None
-) -> list[Pose]:
-    """Poses with (m, 2) shifts [px] that give all images the mean and spread of the first one."""
-    mean, spread = float(images[0].mean(dtype=np.float64)), float(images[0].std(dtype=np.float64))
-    poses = []
-    for n, image in enumerate(images):
-        contrast = spread / float(image.std(dtype=np.float64))
-        brightness = mean - contrast * float(image.mean(dtype=np.float64))
-        row, col = (0.0, 0.0) if shifts is None else shifts[n]
-        poses.append(Pose((float(row), float(col)), 0.0, contrast, brightness))
+) -> FloatArray:
+    """(m, 5) poses with (m, 2) shifts [px] that give all images the first one's mean and spread."""
+    mean, spread = (np.array([f(im, dtype=np.float64) for im in images]) for f in (np.mean, np.std))
+    poses = np.zeros((len(images), POSE_UNKNOWNS))
+    poses[:, :2] = 0.0 if shifts is None else shifts
+    poses[:, 3] = spread[0] / spread
+    poses[:, 4] = mean[0] - poses[:, 3] * mean
     return poses
 
 
@@ -199,8 +178,8 @@ class Fit:
 
     coefficients: FloatArray
     """(k,) of the model."""
-    poses: tuple[Pose, ...]
-    """One for each view."""
+    poses: FloatArray
+    """(views, 5) of each view."""
     inverse: FloatArray
     """(K, K) of the normal matrix: of the coefficients, then of each view's unknowns."""
     free: NDArray[np.bool_]
@@ -209,6 +188,8 @@ class Fit:
     """Scatter about the mean [grey levels squared]."""
     freedom: int
     """Degrees of freedom of that."""
+    converged: bool
+    """Whether the last step was short enough."""
     matches: FloatArray
     """(views,) correlation of each photograph with the mean of the others [-]."""
 
@@ -248,17 +229,18 @@ def fit_views(
         own = np.zeros(free.shape)
         own[free] = step[len(c) :]
         c = c + step[: len(c)]
-        views = with_poses(views, [v.pose.stepped(s) for v, s in zip(views, own, strict=True)])
+        views = with_poses(views, np.add([view.pose for view in views], own))
         length = max(np.abs(step[: len(c)]).max(), np.abs(own * px).max())
         if length < tolerance_px:
             break
     return Fit(
         coefficients=c,
-        poses=tuple(view.pose for view in views),
+        poses=np.array([view.pose for view in views]),
         inverse=eigen.inverse(),
         free=free,
         sum_of_squares=squares,
         freedom=max(1, freedom - len(step)),
+        converged=bool(length < tolerance_px),
         matches=matches,
     )
 
@@ -311,18 +293,19 @@ def _sample(
     col: FloatArray,
 ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
     """Where a view shows the points; grey levels and their derivatives, 0 elsewhere."""
-    (rows, cols), pose = view.spline.shape, view.pose
+    rows, cols = view.spline.shape
+    down, right, angle, contrast, brightness = view.pose
     arm_row, arm_col = row - 0.5 * (rows - 1), col - 0.5 * (cols - 1)
-    cos, sin = np.cos(pose.angle), np.sin(pose.angle)
-    at_row = 0.5 * (rows - 1) + cos * arm_row - sin * arm_col + pose.shift[0]
-    at_col = 0.5 * (cols - 1) + sin * arm_row + cos * arm_col + pose.shift[1]
+    cos, sin = np.cos(angle), np.sin(angle)
+    at_row = 0.5 * (rows - 1) + cos * arm_row - sin * arm_col + down
+    at_col = 0.5 * (cols - 1) + sin * arm_row + cos * arm_col + right
     p_row, p_col = distortion.observed(at_row, at_col) if view.distorted else (at_row, at_col)
     border = view.border_px
     inside = (p_row >= border) & (p_row <= rows - 1 - border)
     inside &= (p_col >= border) & (p_col <= cols - 1 - border)
     value, d_row, d_col = np.zeros(row.shape), np.zeros(row.shape), np.zeros(row.shape)
     value[inside], d_row[inside], d_col[inside] = view.spline.sample(p_row[inside], p_col[inside])
-    slope = pose.contrast * np.stack([d_row, d_col])
+    slope = contrast * np.stack([d_row, d_col])
     columns = np.zeros((len(c) + POSE_UNKNOWNS, row.size))
     if view.distorted:
         s_row, s_col = model.sensitivities(c, at_row, at_col)
@@ -331,7 +314,7 @@ def _sample(
     turn_row, turn_col = -sin * arm_row - cos * arm_col, cos * arm_row - sin * arm_col
     columns[len(c) :] = [*slope, slope[0] * turn_row + slope[1] * turn_col, value, inside]
     kept = np.r_[np.ones(len(c), np.bool_), view.free]
-    normalised = np.where(inside, pose.contrast * value + pose.brightness, 0.0)
+    normalised = np.where(inside, contrast * value + brightness, 0.0)
     return inside, normalised, columns[kept]
 
 
