@@ -28,6 +28,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 Turns = tuple[Fraction, Fraction]
+Shifts = Sequence[tuple[int, int]]  # of copies, along a1 and a2
 
 _SNAP = 1e-3  # rad: how near to a fraction a wave found by descent is
 _DEGENERATE = 1e-6  # of the eigenvalues' scale: values that far apart belong to one set
@@ -69,9 +70,10 @@ def real_modes(
             "for these waves together; ask for fewer of them or a larger 'largest'"
         )
     enlarged, bloch = cell.cell.enlarged(m, n), BlochWaves(cell, state)
-    places = _copies(cell.cell, enlarged, (m, n))
+    shifts = list(product(range(m), range(n)))
+    places = _copies(cell.cell, enlarged, shifts)
     found = [_lowest_set(bloch, _phases(turn)) for turn in turns]
-    shapes = [_real_fields(cell, modes, enlarged, places) for modes in found]
+    shapes = [_real_fields(cell, modes, shifts, places) for modes in found]
     repeats = [len(s) // len(modes.eigenvalues) for s, modes in zip(shapes, found, strict=True)]
     return ModeSet(
         mesh=enlarged.mesh,
@@ -131,27 +133,24 @@ def canonical(vectors: NDArray[Any]) -> NDArray[Any]:
     return np.column_stack([first, canonical(vectors @ Q[:, 1 : len(row)])])
 
 
-def _copies(cell: UnitCell, enlarged: UnitCell, copies: tuple[int, int]) -> NDArray[np.int64]:
+def _copies(cell: UnitCell, enlarged: UnitCell, shifts: Shifts) -> NDArray[np.int64]:
     """(m n, nodes) numbers in the enlarged mesh of the nodes of each copy of the cell."""
     tree = cKDTree(enlarged.mesh.nodes)
-    shifts = product(range(copies[0]), range(copies[1]))
     moved = [cell.mesh.nodes + np.array(shift) @ cell.lattice for shift in shifts]
     return np.stack([tree.query(nodes)[1] for nodes in moved])
 
 
 def _real_fields(
-    cell: PeriodicCell, modes: BlochModes, enlarged: UnitCell, places: NDArray[np.int64]
+    cell: PeriodicCell, modes: BlochModes, shifts: Shifts, places: NDArray[np.int64]
 ) -> FloatArray:
     """(c, n, 2) orthonormal real fields on the enlarged cell that the Bloch vectors amount to."""
     material = cell.filling * cell.cell.area
-    moves = enlarged.mesh.nodes[places[:, 0]] - cell.cell.mesh.nodes[0]
-    copies = np.rint(moves @ np.linalg.inv(cell.cell.lattice))
-    phases = np.exp(1j * (copies @ np.asarray(modes.wave)))
+    phases = np.exp(1j * (np.array(shifts) @ np.asarray(modes.wave)))
     displaced = (cell.reduction.displacement(x, modes.wave) for x in modes.vectors.T)
     at_nodes = np.stack([u.ravel() for u in displaced], axis=1)
     fields: list[FloatArray] = []
     for field in math.sqrt(material) * canonical(at_nodes).T:
-        whole = np.empty((len(enlarged.mesh.nodes), 2), dtype=np.complex128)
+        whole = np.empty((places.max() + 1, 2), dtype=np.complex128)
         for place, phase in zip(places, phases, strict=True):
             whole[place] = phase * field.reshape(-1, 2)
         if np.isrealobj(modes.vectors):
