@@ -17,7 +17,8 @@ from modeharvest.imaging.mapping.element_table import (
     INSIDE,
     OVERLAPPING,
     UNASSIGNED,
-    Band,
+    ElementTable,
+    Pixels,
 )
 from modeharvest.imaging.mapping.inversion import (
     ON_EDGE,
@@ -46,9 +47,20 @@ class _Inverse(NamedTuple):
 
 
 @compiled()
-def fill_affine(band: Band, e: int, first: int, last: int) -> None:
-    """Assign the element's pixels in image rows ``first`` ... ``last`` - 1."""
-    elements, fields, pixels, state, begin = band
+def fill_affine(
+    elements: ElementTable,
+    fields: FloatArray,
+    pixels: Pixels,
+    e: int,
+    first: int,
+    last: int,
+    state: NDArray[np.uint8],
+    begin: int,
+) -> None:
+    """Assign the element's pixels in image rows ``first`` ... ``last`` - 1.
+
+    ``state`` holds those of a band of rows, whose pixels begin at ``begin``.
+    """
     triangular, back = elements.triangular, _inverse(elements.polynomials[e])
     centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
     element, values, residual = pixels.element, pixels.values, pixels.residual

@@ -81,19 +81,6 @@ class Pixels(NamedTuple):
     """Of the image's grid [mm]."""
 
 
-class Band(NamedTuple):
-    """Some rows of an image while they are filled."""
-
-    elements: ElementTable
-    fields: FloatArray
-    """(m, c, 9) polynomials over the elements; of none (c = 0) the local coordinates are found."""
-    pixels: Pixels
-    state: NDArray[np.uint8]
-    """Of the pixels of these rows: UNASSIGNED, ..."""
-    begin: int
-    """Where these begin among ``pixels``."""
-
-
 def tabulate_elements(
     nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid
 ) -> ElementTable:

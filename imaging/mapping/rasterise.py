@@ -24,7 +24,6 @@ from modeharvest.imaging.mapping.element_table import (
     INSIDE,
     OVERLAPPING,
     UNASSIGNED,
-    Band,
     ElementTable,
     Pixels,
     proved_reach,
@@ -112,39 +111,52 @@ def fill(
         of_rows = selected[top * pixels.cols : bottom * pixels.cols]
         for k in range(of_rows.size):
             state[k] = UNASSIGNED if of_rows[k] else EXCLUDED
-    band = Band(elements, fields, pixels, state, begin)
     real = np.empty((6, _BATCH))
     batch = Batch(real[0], real[1], real[2], real[3], real[4], real[5],
                   np.empty(_BATCH, dtype=np.int64))  # fmt: skip
     for e in visited:
         first, last = max(top, elements.row_from[e]), min(bottom, elements.row_to[e])
         if elements.affine[e]:
-            fill_affine(band, e, first, last)
+            fill_affine(elements, fields, pixels, e, first, last, state, begin)
         else:
-            _fill_element(band, batch, e, first, last)
-    return _mark_background(band)
+            _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
+    return _mark_background(pixels.element, pixels.values, pixels.residual, state, begin)
 
 
 @compiled()
-def _mark_background(band: Band) -> int:
+def _mark_background(
+    element: NDArray[np.int32],
+    values: FloatArray,
+    residual: NDArray[np.float32],
+    state: NDArray[np.uint8],
+    begin: int,
+) -> int:
     """Mark what is unassigned as background; count what lies in two elements."""
-    pixels, begin = band.pixels, band.begin
     overlapping = 0
-    for k in range(band.state.size):
-        overlapping += band.state[k] == OVERLAPPING
-    if pixels.residual.size:  # else these pixels are on their way elsewhere
-        for k in range(begin, begin + band.state.size):
-            if pixels.element[k] < 0:
-                pixels.residual[k] = np.nan
-                for field in range(pixels.values.shape[0]):
-                    pixels.values[field, k] = np.nan
+    for k in range(state.size):
+        overlapping += state[k] == OVERLAPPING
+    if residual.size:  # else these pixels are on their way elsewhere
+        for k in range(state.size):
+            if element[begin + k] < 0:
+                residual[begin + k] = np.nan
+                for field in range(values.shape[0]):
+                    values[field, begin + k] = np.nan
     return overlapping
 
 
 @compiled()
-def _fill_element(band: Band, batch: Batch, e: int, first: int, last: int) -> None:
+def _fill_element(
+    elements: ElementTable,
+    fields: FloatArray,
+    pixels: Pixels,
+    e: int,
+    first: int,
+    last: int,
+    state: NDArray[np.uint8],
+    begin: int,
+    batch: Batch,
+) -> None:
     """Assign the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
-    elements, _, pixels, state, begin = band
     centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
     polynomial, sides, corners = elements.polynomials[e], elements.sides[e], elements.corners
     curved, cols, first_row = not elements.triangular, pixels.cols, pixels.first_row
@@ -164,7 +176,7 @@ def _fill_element(band: Band, batch: Batch, e: int, first: int, last: int) -> No
             past -= 1
         while col < past:
             if count == _BATCH:
-                _assign(band, batch, e, count)
+                _assign(elements, fields, pixels, e, state, begin, batch, count)
                 count = 0
             stop = min(past, col + _BATCH - count)
             n, col_from = stop - col, float(col - centre_col)
@@ -176,18 +188,26 @@ def _fill_element(band: Band, batch: Batch, e: int, first: int, last: int) -> No
                 where[count + k] = at + col + k
             count += n
             col = stop
-    _assign(band, batch, e, count)
+    _assign(elements, fields, pixels, e, state, begin, batch, count)
 
 
 @compiled()
-def _assign(band: Band, batch: Batch, e: int, count: int) -> None:
+def _assign(
+    elements: ElementTable,
+    fields: FloatArray,
+    pixels: Pixels,
+    e: int,
+    state: NDArray[np.uint8],
+    begin: int,
+    batch: Batch,
+    count: int,
+) -> None:
     """Invert a batch; assign those of its pixels that are inside and still unassigned."""
-    elements, _, pixels, state, begin = band
     polynomial, triangular = elements.polynomials[e], elements.triangular
     row, col, s, t, off, residual, where = batch
     element, residuals = pixels.element, pixels.residual
     invert(polynomial, triangular, row, col, s, t, count)
-    _check(band, batch, e, 0, count)
+    _check(elements, pixels, e, row, col, s, t, off, residual, count)
     reach = np.nan  # it is proved when first needed
     assigned = 0
     for k in range(count):
@@ -203,7 +223,7 @@ def _assign(band: Band, batch: Batch, e: int, count: int) -> None:
             if not found:
                 continue
             depth = -outside(triangular, s[k], t[k])
-            _check(band, batch, e, k, k + 1)
+            _check(elements, pixels, e, row[k:], col[k:], s[k:], t[k:], off[k:], residual[k:], 1)
         if depth < -ON_EDGE:
             continue
         at = where[k]
@@ -216,18 +236,27 @@ def _assign(band: Band, batch: Batch, e: int, count: int) -> None:
             assigned += 1
         elif depth > CLEAR_OF_EDGES and state[at - begin] == INSIDE:
             state[at - begin] = OVERLAPPING
-    _write(band, batch, e, assigned)
+    _write(fields, pixels.values, e, triangular, where, s, t, assigned)
 
 
 @compiled(relaxed=True)
-def _check(band: Band, batch: Batch, e: int, first: int, past: int) -> None:
-    """Compute the residuals of the pixels ``first`` ... ``past`` - 1, two ways: see Batch."""
-    elements, pixels = band.elements, band.pixels
-    row, col, s, t, off, residual, _ = batch
+def _check(
+    elements: ElementTable,
+    pixels: Pixels,
+    e: int,
+    row: FloatArray,
+    col: FloatArray,
+    s: FloatArray,
+    t: FloatArray,
+    off: FloatArray,
+    residual: FloatArray,
+    count: int,
+) -> None:
+    """Compute the residuals of the first ``count`` pixels, two ways: see Batch."""
     curved = not elements.triangular
     a = coefficients(elements.polynomials[e, 0])
     b = coefficients(elements.polynomials[e, 1])
-    for k in range(first, past):
+    for k in range(count):
         p = value(a, curved, s[k], t[k]) - row[k]
         q = value(b, curved, s[k], t[k]) - col[k]
         off[k] = p * p + q * q
@@ -236,16 +265,23 @@ def _check(band: Band, batch: Batch, e: int, first: int, past: int) -> None:
     x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
     h = pixels.pixel_size
     y0, x0 = pixels.y0 - h * elements.centres[e, 0], pixels.x0 + h * elements.centres[e, 1]
-    for k in range(first, past):
+    for k in range(count):
         at = x0 + h * col[k], y0 - h * row[k], h
         residual[k] = distance_px(x, y, curved, s[k], t[k], at)
 
 
 @compiled(relaxed=True)
-def _write(band: Band, batch: Batch, e: int, count: int) -> None:
+def _write(
+    fields: FloatArray,
+    values: FloatArray,
+    e: int,
+    triangular: bool,
+    where: IntArray,
+    s: FloatArray,
+    t: FloatArray,
+    count: int,
+) -> None:
     """Write the fields, or the local coordinates, at the first ``count`` pixels of a batch."""
-    fields, values, curved = band.fields, band.pixels.values, not band.elements.triangular
-    s, t, where = batch.s, batch.t, batch.where
     if fields.shape[1] == 0:
         for k in range(count):
             values[0, where[k]] = s[k]
@@ -253,7 +289,7 @@ def _write(band: Band, batch: Batch, e: int, count: int) -> None:
     for field in range(fields.shape[1]):
         a, out = coefficients(fields[e, field]), values[field]
         for k in range(count):
-            out[where[k]] = value(a, curved, s[k], t[k])
+            out[where[k]] = value(a, not triangular, s[k], t[k])
 
 
 @compiled(relaxed=True)
