@@ -365,7 +365,7 @@ def test_a_lattice_that_is_a_mechanism_is_refused() -> None:
 
 
 def test_bad_searches_are_refused() -> None:
-    with pytest.raises(InputError, match="0 < largest"):
+    with pytest.raises(InputError, match="a largest load above 0"):
         CriticalSearch(largest=0.0)
     with pytest.raises(InputError, match="zone path"):
         zone_path(ZONES["square"][:1], np.eye(2), 10)

@@ -51,7 +51,7 @@ def start(case: str) -> tuple[CellPath, ModeSet]:
 
 def started(cell: UnitCell, loading: MacroLoading, material: Material) -> tuple[CellPath, ModeSet]:
     primitive = PeriodicCell(cell, material)
-    search = CriticalSearch(divisions=2, first_step=5e-3)
+    search = CriticalSearch(divisions=2)
     found = first_critical(CellPath(primitive, loading), search)
     modes = real_modes(primitive, found.state, found.waves)
     m, n = modes.info["copies"]

@@ -28,12 +28,9 @@ class CriticalSearch:
     """Of the load."""
 
     def __post_init__(self) -> None:
-        if not (0 < self.largest < 1 and self.largest_step >= SMALLEST_STEP):
-            raise InputError(
-                f"search: expected 0 < largest < 1 and steps of {SMALLEST_STEP:g} or more, got "
-                f"{self}"
-            )
+        require_within("search: expected a largest load", self.largest, 0.0, above=True)
         require_within("search: expected divisions", self.divisions, 2, 200)
+        require_within("search: expected a largest_step", self.largest_step, SMALLEST_STEP)
 
 
 Wave = tuple[float, float]

@@ -338,7 +338,9 @@ class LatticeCase(CaseModel):
         return {**super().plain(), "lattice": lattice, "material": material}
 
     @model_validator(mode="after")
-    def _is_square_to_be_studied(self) -> Self:
+    def _can_be_searched_and_studied(self) -> Self:
+        if self.search.largest >= 1:
+            raise InputError(f"search: expected 0 < largest < 1, got {self.search.largest}")
         if self.study is not None and not isinstance(self.lattice, SquareLattice):
             raise InputError(
                 "expected a square lattice for a [study], got another kind; leave [study] out"
