@@ -49,44 +49,31 @@ class PathOptions:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A virtual compression test. Defaults: the paper's 6 x 10 specimen.
-
-    Parameters
-    ----------
-    specimen, material
-        Geometry [mm] and strain energy density [MPa].
-    strains
-        Nominal strains of the snapshots, ascending, compression positive [-].
-    mesh_size
-        Target edge length of the T6 elements [mm].
-    edges
-        Loaded edges "clamped" or "sliding".
-    branches
-        What to keep above the critical strain, out of "primary" (unstable there), "buckled+" and
-        "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any).
-    imperfection
-        Scatter of the holes; with any, there is no bifurcation but one natural path.
-    path
-        How the equilibrium path is followed.
-    tilt
-        By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
-        about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is not
-        quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
-    guided
-        Fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail would;
-        ``holes_y`` has to be even, rows not staggered. Keeps long specimens from bowing.
-    """
+    """A virtual compression test. Defaults: the paper's 6 x 10 specimen."""
 
     specimen: Specimen = field(default_factory=Specimen)
     material: Material = field(default_factory=Ogden)
+    """Geometry [mm] and strain energy density [MPa]."""
     strains: tuple[float, ...] = (0.078, 0.128)
+    """Nominal strains of the snapshots, ascending, compression positive [-]."""
     mesh_size: float = 0.2
+    """Target edge length of the T6 elements [mm]."""
     edges: str = "clamped"
+    """Loaded edges "clamped" or "sliding"."""
     branches: tuple[str, ...] = ("buckled+",)
+    """What to keep above the critical strain, out of "primary" (unstable there), "buckled+" and
+    "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any)."""
     imperfection: Imperfection = field(default_factory=Imperfection)
+    """Scatter of the holes; with any, there is no bifurcation but one natural path."""
     path: PathOptions = field(default_factory=PathOptions)
+    """How the equilibrium path is followed."""
     tilt: float = 0.0
+    """By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise about
+    its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is not quite
+    parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed."""
     guided: bool = False
+    """Fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail would;
+    ``holes_y`` has to be even, rows not staggered. Keeps long specimens from bowing."""
 
     def __post_init__(self) -> None:
         strains = self.strains

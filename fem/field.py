@@ -104,22 +104,15 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A mesh and its snapshots, with everything needed to make them again.
-
-    Parameters
-    ----------
-    mesh
-        The undeformed specimen.
-    snapshots
-        Its equilibrium states.
-    info
-        Plain JSON values: geometry, material, loading, versions, seed, the critical strain and what
-        the path cost.
-    """
+    """A mesh and its snapshots, with everything needed to make them again."""
 
     mesh: Mesh
+    """The undeformed specimen."""
     snapshots: tuple[Snapshot, ...]
+    """Its equilibrium states."""
     info: Mapping[str, Any] = field(default_factory=dict)
+    """Plain JSON values: geometry, material, loading, versions, seed, the critical strain and what
+    the path cost."""
 
     def __post_init__(self) -> None:
         if not len(self.mesh.cells):

@@ -30,20 +30,14 @@ class Ogden:
     Lame's lambda = kappa, Poisson's ratio nu = kappa/(2 (kappa + mu)). The form is that of van Bree
     et al., Comput. Methods Appl. Mech. Eng. 372 (2020) 113333; the default constants are this
     project's choice (mu = 0.60 MPa, nu = 0.45), because the paper's own are not public.
-
-    Parameters
-    ----------
-    moduli
-        c_i [MPa].
-    exponents
-        m_i [-], other than 0.
-    kappa
-        Constant of the volumetric term [MPa].
     """
 
     moduli: tuple[float, ...] = (1.2,)
+    """c_i [MPa]."""
     exponents: tuple[float, ...] = (3.0,)
+    """m_i [-], other than 0."""
     kappa: float = 5.4
+    """Constant of the volumetric term [MPa]."""
 
     def __post_init__(self) -> None:
         if len(self.moduli) != len(self.exponents) or not self.moduli:

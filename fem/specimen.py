@@ -44,41 +44,29 @@ class Specimen:
     In triangular stacking every second row, counted from below, has one hole less: no hole is cut,
     the specimen is symmetric about the y axis, and with an odd number of rows about the x axis too.
     The cellular part is the bounding box of the holes' cells; what these leave of it is solid.
-
-    Parameters
-    ----------
-    holes_x, holes_y
-        Number of holes in a row, along the loading direction; number of rows.
-    diameter
-        Hole diameter d, of ellipses along x, of a graded specimen at its centre [mm].
-    pitch
-        Centre-to-centre distance l along a row, the unit cell size [mm].
-    bulk_x, bulk_y
-        Width of the solid strips at loaded and at free edges [mm]; 0: none.
-    grading_x, grading_y
-        Change of the diameter from hole to hole, per distance of their centres in the loading and
-        in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x + grading_y y. A
-        specimen graded in one direction keeps its mirror symmetry in the other. Ellipses keep their
-        aspect.
-    stacking
-        "square", "rectangular" or "triangular" (equilateral, rows along x): ``STACKINGS``.
-    pitch_y
-        Distance of the rows [mm] of rectangular stacking; others have it from ``pitch``.
-    diameter_y
-        Diameter of elliptical holes along y [mm]; None for round ones.
     """
 
     holes_x: int = 6
     holes_y: int = 10
+    """Number of holes in a row, along the loading direction; number of rows."""
     diameter: float = 1.5
+    """Hole diameter d, of ellipses along x, of a graded specimen at its centre [mm]."""
     pitch: float = 1.9
+    """Centre-to-centre distance l along a row, the unit cell size [mm]."""
     bulk_x: float = 1.9
     bulk_y: float = 0.9
+    """Width of the solid strips at loaded and at free edges [mm]; 0: none."""
     grading_x: float = 0.0
     grading_y: float = 0.0
+    """Change of the diameter from hole to hole, per distance of their centres in the loading and in
+    the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x + grading_y y. A specimen
+    graded in one direction keeps its mirror symmetry in the other. Ellipses keep their aspect."""
     stacking: str = "square"
+    """"square", "rectangular" or "triangular" (equilateral, rows along x): ``STACKINGS``."""
     pitch_y: float | None = None
+    """Distance of the rows [mm] of rectangular stacking; others have it from ``pitch``."""
     diameter_y: float | None = None
+    """Diameter of elliptical holes along y [mm]; None for round ones."""
 
     def __post_init__(self) -> None:
         if not (1 <= self.holes_x <= MOST_HOLES and 1 <= self.holes_y <= MOST_HOLES):

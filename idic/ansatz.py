@@ -77,24 +77,17 @@ class Ansatz:
 
     The unknowns are, in this order: v0 along x, v0 along y [mm], v_1 ... v_n [mm], then the
     parameters of phi_1 ... phi_n, then those of the brightness.
-
-    Parameters
-    ----------
-    domain
-        The box that the Chebyshev polynomials span; the whole specimen [mm].
-    modes
-        phi_1 ... phi_n; none gives a plain global DIC with v0 alone.
-    v0_degree, v_degree
-        Total degrees of v0 (5 in the paper) and of every v_i (6).
-    brightness
-        Whether gain and offset of the grey levels are unknowns, too; by default not.
     """
 
     domain: Box
+    """The box that the Chebyshev polynomials span; the whole specimen [mm]."""
     modes: tuple[FourierMode, ...] = ()
+    """phi_1 ... phi_n; none gives a plain global DIC with v0 alone."""
     v0_degree: int = 5
     v_degree: int = 6
+    """Total degrees of v0 (5 in the paper) and of every v_i (6)."""
     brightness: Brightness = field(default_factory=Brightness)
+    """Whether gain and offset of the grey levels are unknowns, too; by default not."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "modes", tuple(self.modes))

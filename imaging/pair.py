@@ -127,28 +127,20 @@ class ImagePair:
     """A reference and a deformed image of one size; checked, and read-only.
 
     InputError if sizes differ, a mask is empty, or an image has NaN or one level on its material.
-
-    Parameters
-    ----------
-    reference, deformed
-        (rows, cols) grey levels f and g; kept as float32.
-    grid
-        Their pixels.
-    mask, deformed_mask
-        (rows, cols) True on material, in f and in g; None for everywhere.
-    truth
-        What a measurement should find, where that is known.
-    strain
-        Nominal strain of the deformed image [-]; NaN where it isn't known.
     """
 
     reference: FloatImage
     deformed: FloatImage
+    """(rows, cols) grey levels f and g; kept as float32."""
     grid: PixelGrid
+    """Their pixels."""
     mask: BoolArray | None = None
     deformed_mask: BoolArray | None = None
+    """(rows, cols) True on material, in f and in g; None for everywhere."""
     truth: Truth | None = None
+    """What a measurement should find, where that is known."""
     strain: float = math.nan
+    """Nominal strain of the deformed image [-]; NaN where it isn't known."""
 
     def __post_init__(self) -> None:
         for name in ("reference", "deformed"):

@@ -23,43 +23,30 @@ _BYTES_PER_PIXEL = 250.0
 
 @dataclass(frozen=True)
 class ImagingSpec:
-    """How a specimen is imaged; InputError if a value is out of its range.
-
-    Parameters
-    ----------
-    pixel_size
-        Edge of a pixel [mm/px].
-    margin_px
-        Background kept around the specimen in all its states [px]; the image size follows.
-    shape
-        (rows, cols) instead of the size that follows from the margin [px].
-    background
-        Intensity where there is no material [fraction of full scale].
-    bits
-        Bits of the camera-like copies, 1 to 16.
-    speckle
-        The pattern.
-    sensor
-        What a pixel averages, and its noise; the default shows points without noise.
-    distortion
-        Of the lens: a camera's, or the name of a file; None is a perfect lens. Where there is one,
-        pixels show points, in the images and in their masks as the lens distorts them; the truth
-        stays on the ideal grid, that of the images once undistorted.
-    affine_distortion
-        False takes the distortion's affine part away
-        (:func:`modeharvest.imaging.distortion.lens.without_affine`): it is no more than
-        another pixel size, unobservable in images of a target whose shifts are unknown.
-    """
+    """How a specimen is imaged; InputError if a value is out of its range."""
 
     pixel_size: float = 0.01
+    """Edge of a pixel [mm/px]."""
     margin_px: int = 40
+    """Background kept around the specimen in all its states [px]; the image size follows."""
     shape: tuple[int, int] | None = None
+    """(rows, cols) instead of the size that follows from the margin [px]."""
     background: float = 0.0
+    """Intensity where there is no material [fraction of full scale]."""
     bits: int = 8
+    """Bits of the camera-like copies, 1 to 16."""
     speckle: SpeckleSpec = field(default_factory=SpeckleSpec)
+    """The pattern."""
     sensor: Sensor = field(default_factory=Sensor)
+    """What a pixel averages, and its noise; the default shows points without noise."""
     distortion: CameraDistortion | str | None = None
+    """Of the lens: a camera's, or the name of a file; None is a perfect lens. Where there is one,
+    pixels show points, in the images and in their masks as the lens distorts them; the truth stays
+    on the ideal grid, that of the images once undistorted."""
     affine_distortion: bool = True
+    """False takes the distortion's affine part away
+    (:func:`modeharvest.imaging.distortion.lens.without_affine`): it is no more than another pixel
+    size, unobservable in images of a target whose shifts are unknown."""
 
     def __post_init__(self) -> None:
         require_within("imaging: expected a pixel size [mm]", self.pixel_size, 0.0, above=True)
