@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.imaging.mapping.affine import fill_affine
 from modeharvest.imaging.mapping.element_table import (
     CLEAR_OF_EDGES,
     EDGE,
@@ -116,10 +115,7 @@ def fill(
                   np.empty(_BATCH, dtype=np.int64))  # fmt: skip
     for e in visited:
         first, last = max(top, elements.row_from[e]), min(bottom, elements.row_to[e])
-        if elements.affine[e]:
-            fill_affine(elements, fields, pixels, e, first, last, state, begin)
-        else:
-            _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
+        _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
     return _mark_background(pixels.element, pixels.values, pixels.residual, state, begin)
 
 
