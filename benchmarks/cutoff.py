@@ -93,7 +93,7 @@ def found(pair: ImagePair, specimen: Specimen, name: str, noise: float, width: f
     ansatz = Ansatz.of_specimen(specimen, options=AnsatzOptions(4, 3))
     guess = ansatz.initial_guess(pair.strain)
     start = fit_displacement(pair.truth.displacement, pair.grid, ansatz, guess, pair.mask)
-    mesh = mesh_of_mask(pair.masks[0], pair.grid, 24.0, 12.0)
+    mesh = mesh_of_mask(pair.masks[0], pair.grid, 24.0, 12.0).mesh
 
     def measured(cutoff: float | None) -> tuple[float, float]:
         result = measure_displacement(

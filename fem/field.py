@@ -178,11 +178,18 @@ class Solution:
 
 
 def in_space(mesh: Mesh, fields: Mapping[str, FloatArray]) -> meshio.Mesh:
-    """A mesh with nodal vectors (n, 2) by name, all in three dimensions: VTK knows no plane."""
-    flat = ((0, 0), (0, 1))
-    data = {name: np.pad(values, flat) for name, values in fields.items()}
+    """A mesh with nodal fields by name, all in three dimensions: VTK knows no plane.
+
+    Scalars are (n,), vectors (n, 2), tensors (n, 2, 2), whose nine components become one row.
+    """
+
+    def padded(values: FloatArray) -> FloatArray:
+        spatial = np.pad(values, ((0, 0), *((0, 1),) * (values.ndim - 1)))
+        return spatial if values.ndim < 3 else spatial.reshape(len(values), 9)
+
+    data = {name: padded(values) for name, values in fields.items()}
     cells = [(_MESHIO_NAME[mesh.element], mesh.cells)]
-    return meshio.Mesh(np.pad(mesh.nodes, flat), cells, point_data=data)
+    return meshio.Mesh(padded(mesh.nodes), cells, point_data=data)
 
 
 def write_mesh(file: h5py.File, mesh: Mesh) -> None:

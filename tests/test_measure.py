@@ -15,7 +15,7 @@ from manufactured import inverted, speckle
 from plate_with_hole import GRID, plate_pair
 from test_cli import called, error_line
 
-from modeharvest.idic.finite_element.files import read_result, write_csv, write_result
+from modeharvest.idic.finite_element.files import Given, read_result, write_csv, write_result
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.field import read_field
@@ -118,7 +118,7 @@ def test_finished_images_are_not_measured_again(plate: Plate, measured: Path) ->
 
 def test_hdf5_comes_back_as_it_was(result: NodalResult, tmp_path: Path) -> None:
     path = tmp_path / "again.h5"
-    write_result(path, result, "px")
+    write_result(path, result, Given("px"))
     again = read_result(path)
     for f in dataclasses.fields(result):
         if f.name not in ("mesh", "timings_s"):
@@ -202,7 +202,7 @@ def test_elements_beside_the_mask_are_left_out(plate: Plate, tmp_path: Path) -> 
     mask = plate.mask.copy()
     mask[:, 130:] = False
     write_image(tmp_path / "mask.tif", mask)
-    mesh = mesh_of_mask(plate.mask, GRID, 24.0)
+    mesh = mesh_of_mask(plate.mask, GRID, 24.0, 24.0).mesh
     points = np.pad(mesh.nodes, ((0, 0), (0, 1)))
     meshio.Mesh(points, [("triangle6", mesh.cells)]).write(tmp_path / "mesh.vtu")
     summary = measure(plate.folder / "ref.tif", [plate.folder / "a.tif"], tmp_path / "out",
@@ -233,7 +233,7 @@ def test_start_follows_what_no_polynomial_does() -> None:
     pattern, at = speckle(1, grid), np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
     before = inverted(wave, at, 1e-9)
     pair = ImagePair(*(pattern(x[..., 0], x[..., 1]) for x in (at, before)), grid)
-    mesh = mesh_of_mask(pair.masks[0], grid, 24.0)
+    mesh = mesh_of_mask(pair.masks[0], grid, 24.0, 24.0).mesh
     start = block_motion(pair, mesh, None, ("f", "g"))
     off = np.linalg.norm(start - wave(mesh.nodes), axis=1) / grid.pixel_size
     inner = (abs(mesh.nodes) < 1.2).all(axis=1)  # where there are blocks on all sides

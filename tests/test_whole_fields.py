@@ -168,7 +168,7 @@ def test_gradient_is_linear(mesh: Mesh) -> None:
 
 def test_files_hold_every_field(mesh: Mesh, tmp_path: Path) -> None:
     small = Mesh(0.8 * mesh.nodes / np.abs(mesh.nodes).max(), mesh.cells, "T6")
-    given = Given(Ogden())
+    given = Given(material=Ogden())
     result = replace(
         affine(small, STATES[0]),
         gradient_covariance=np.broadcast_to(1e-6 * np.eye(4), (len(small.nodes), 4, 4)),

@@ -17,7 +17,7 @@ PLATE = is_material(np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1))
 
 
 def test_outline_to_sub_pixel() -> None:
-    mesh = mesh_of_mask(PLATE, GRID, 20.0, 10.0)
+    mesh = mesh_of_mask(PLATE, GRID, 20.0, 10.0).mesh
     edge = mesh.nodes[np.unique(boundary_sides(mesh))]
     radius = np.hypot(*edge.T)
     hole = radius < 0.5
@@ -34,14 +34,14 @@ def test_outline_to_sub_pixel() -> None:
 
 
 def test_mesh_covers_the_mask() -> None:
-    mesh = mesh_of_mask(PLATE, GRID, 20.0, 10.0)
+    mesh = mesh_of_mask(PLATE, GRID, 20.0, 10.0).mesh
     covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask
     assert (PLATE & ~covered).sum() < 0.002 * PLATE.sum()
     assert (covered & ~PLATE).sum() < 0.01 * PLATE.sum()
 
 
 def test_whole_image_without_holes() -> None:
-    mesh = mesh_of_mask(np.ones(GRID.shape, dtype=bool), GRID, 30.0)
+    mesh = mesh_of_mask(np.ones(GRID.shape, dtype=bool), GRID, 30.0, 30.0).mesh
     assert locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask.all()
 
 
@@ -52,12 +52,12 @@ def test_islands_are_bodies_and_specks_are_left_out() -> None:
     mask[10:14, 200:204] = True  # a speck
     mask[150:154, 160:164] = False  # dirt
     assert sorted(len(part) for part in outlines(mask, 12.0)) == [1, 2]
-    found = meshable(mask, 12.0)
-    assert [text.split(" ")[0] for text in found.changes] == ["Holes", "1"]
-    assert "16 px at row 10, column 200" in found.changes[1]
+    kept, changes = meshable(mask, 12.0)
+    assert [text.split(" ")[0] for text in changes] == ["Holes", "1"]
+    assert "16 px at row 10, column 200" in changes[1]
     mask[10:14, 200:204], mask[150:154, 160:164] = False, True
-    np.testing.assert_array_equal(found.mask, mask)
-    mesh = mesh_of_mask(mask, GRID, 12.0)
+    np.testing.assert_array_equal(kept, mask)
+    mesh = mesh_of_mask(mask, GRID, 12.0, 12.0).mesh
     covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask
     assert (mask & ~covered).sum() < 100
     assert not covered[55:65, 55:65].any()
@@ -66,18 +66,17 @@ def test_islands_are_bodies_and_specks_are_left_out() -> None:
 def test_narrow_material_is_left_out() -> None:
     mask = PLATE.copy()
     mask[60:120, 30:60] = mask[60:120, 62:80] = False  # 2 px between them
-    found = meshable(mask, 12.0)
+    found = mesh_of_mask(mask, GRID, 24.0, 12.0)
     assert "was left out" in found.changes[0]
     assert not found.mask[70:110, 60:62].any()
     assert (mask & ~found.mask).sum() < 2 * 60 + 40  # and of corners a pixel or so
-    mesh_of_mask(found.mask, GRID, 24.0, 12.0)
 
 
 @pytest.mark.parametrize("width", [2, 4, 5, 8])
 def test_slits_have_outlines_that_do_not_cross(width: int) -> None:
     mask = np.ones(GRID.shape, dtype=bool)
     mask[60:160, 100 : 100 + width] = False
-    mesh = mesh_of_mask(mask, GRID, 24.0, 12.0)
+    mesh = mesh_of_mask(mask, GRID, 24.0, 12.0).mesh
     covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID)
     assert covered.doubly_covered == 0
     assert (mask & ~covered.mask).sum() < 100
@@ -87,11 +86,11 @@ def test_no_material() -> None:
     mask = np.zeros(GRID.shape, dtype=bool)
     mask[5:9, 5:9] = True
     with pytest.raises(InputError, match="expected a mask with material for elements of 24 px"):
-        mesh_of_mask(mask, GRID, 24.0)
+        mesh_of_mask(mask, GRID, 24.0, 24.0)
 
 
 def test_linear_triangles_become_quadratic() -> None:
-    mesh = mesh_of_mask(PLATE, GRID, 40.0, 20.0)
+    mesh = mesh_of_mask(PLATE, GRID, 40.0, 20.0).mesh
     linear = Mesh(mesh.nodes, mesh.cells[:, :3], "T3")
     found = quadratic(linear)
     assert found.element == "T6"

@@ -72,10 +72,11 @@ def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> 
     right = at.gradient - weight * at.penalty
     found = at.factor(weight).solve(np.column_stack([right, at.M @ z]))
     step = found[:, 0]
-    Q = at.square_sum - 2.0 * float(step @ at.gradient) + float(step @ (at.M @ step))
+    Q = at.sums.square_sum - 2.0 * float(step @ at.gradient) + float(step @ (at.M @ step))
     t = float(np.sum(z * found[:, 1:])) / _PROBES
-    value = Q / (1.0 - _DEGREES * excess * t / at.pixels) ** 2
-    return Risk(cutoff_px, value / at.pixels, t, float(np.sqrt(Q / (at.pixels - t))))
+    p = at.sums.pixels
+    value = Q / (1.0 - _DEGREES * excess * t / p) ** 2
+    return Risk(cutoff_px, value / p, t, float(np.sqrt(Q / (p - t))))
 
 
 def least_risk(
@@ -147,10 +148,10 @@ def deviations(at: Linearised, cutoff: float, noise: float, unknowns: float) -> 
     weight = at.weight(cutoff)
     factor = at.factor(weight)
     here = at.step(cutoff)
-    random = at.body.samples(at.blocks * at.excess[:, None, None, None])
+    random = at.body.samples(at.sums.blocks * at.sums.excess[:, None, None, None])
     found = noise * factor.solve(random).reshape(-1, 2, SAMPLES)
     if at.prior.samples is not None:
-        blank = mean_around(mesh, np.repeat(1.0 - at.share, 6).reshape(-1, 6))
+        blank = mean_around(mesh, np.repeat(1.0 - at.signal, 6).reshape(-1, 6))
         # The roughness that was found is that of so many unknowns, or the weight is too large.
         grown = float((at.u - at.prior.start) @ at.penalty)
         rough = weight * grown / max(noise**2 * unknowns, _TINY)

@@ -7,7 +7,7 @@ The HDF5 file can be read with h5py alone::
     gradient_covariance (n, 4, 4)
     fields/NAME (n, ...) float32, with @unit: what follows from them, see ``fields.FIELDS``
 
-Lengths are in mm, or in px where the size of a pixel isn't known; ``unit`` says which.
+Lengths are in mm, or in px where the size of a pixel isn't known; ``Given.unit`` says which.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
-import meshio
 import numpy as np
 
-from modeharvest.fem.field import COMPRESSED, read_mesh, write_mesh
+from modeharvest.fem.field import COMPRESSED, in_space, read_mesh, write_mesh
 from modeharvest.fem.materials import Material
 from modeharvest.idic.finite_element.fields import FIELDS
 from modeharvest.idic.finite_element.result import NodalResult, Where
@@ -47,6 +46,8 @@ _VECTORS = {
 class Given(NamedTuple):
     """What else than the measurement is known."""
 
+    unit: str = "mm"
+    """Of lengths: "mm" or "px"."""
     material: Material | None = None
     """In plane strain, for stresses."""
     correlation: Result | None = None
@@ -54,20 +55,17 @@ class Given(NamedTuple):
 
 
 NO_MORE = Given()
-"""Images alone."""
+"""Images alone, whose pixels have a size in mm."""
 
 
-def write_result(
-    path: Path | str, result: NodalResult, unit: str = "mm", given: Given = NO_MORE
-) -> None:
+def write_result(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> None:
     """Write all of a result but its seconds as HDF5, losslessly and atomically.
 
-    ``unit`` of its lengths: "mm" or "px"; for readers without modeharvest also all fields that
-    follow.
+    For readers without modeharvest also all fields that follow.
     """
     with atomic_hdf5(path) as file:
         plain = {name: to_plain(getattr(result, name)) for name in _PLAIN}
-        file.attrs.update(format=FORMAT, unit=unit, info=json.dumps(plain))
+        file.attrs.update(format=FORMAT, unit=given.unit, info=json.dumps(plain))
         write_mesh(file, result.mesh)
         for name in _ARRAYS:
             file.create_dataset(name, data=getattr(result, name), **COMPRESSED)
@@ -77,9 +75,9 @@ def write_result(
             values = field_at(result, name, None, given).astype(np.float32)
             data = file.create_dataset(f"fields/{name}", data=values, **COMPRESSED)
             known = FIELDS.get(name.removeprefix("sd_"))
-            data.attrs["unit"] = known.unit if known else unit
+            data.attrs["unit"] = known.unit if known else given.unit
         for name in ("nodes", *_ARRAYS):
-            file[name].attrs["unit"] = "" if name == "gradient_covariance" else unit
+            file[name].attrs["unit"] = "" if name == "gradient_covariance" else given.unit
 
 
 def read_result(path: Path | str) -> NodalResult:
@@ -127,36 +125,14 @@ def field_at(
     return result.field(name, where, given.material)
 
 
-def write_vtu(
-    path: Path | str, result: NodalResult, unit: str = "mm", given: Given = NO_MORE
-) -> None:
-    """Write mesh and fields for ParaView, atomically; vectors and tensors in three dimensions."""
-    fields = {}
-    for name in field_names(given):
-        values = field_at(result, name, None, given)
-        padded = np.zeros((len(values), *(3,) * (values.ndim - 1)))
-        padded[tuple(slice(size) for size in values.shape)] = values
-        label = f"{name}_{unit}" if name in _VECTORS else name
-        fields[label] = padded.reshape(len(values), *(padded[0].size,) * (values.ndim > 1))
-    nodes = np.pad(result.mesh.nodes, ((0, 0), (0, 1)))
-    mesh = meshio.Mesh(nodes, [("triangle6", result.mesh.cells)], point_data=fields)
+def write_vtu(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> None:
+    """Write mesh and fields for ParaView, atomically."""
+    fields = {
+        f"{name}_{given.unit}" if name in _VECTORS else name: field_at(result, name, None, given)
+        for name in field_names(given)
+    }
     with atomic(path) as temporary:
-        mesh.write(temporary, file_format="vtu")
-
-
-def columns_at(
-    result: NodalResult,
-    points: FloatArray | None = None,
-    unit: str = "mm",
-    given: Given = NO_MORE,
-) -> dict[str, FloatArray]:
-    """Columns (k,) of a table at points (k, 2) [mm], or at the nodes; NaN beside the mesh."""
-    x, y = (result.mesh.nodes if points is None else np.asarray(points, dtype=np.float64)).T
-    row, col = result.grid.to_px(x, y)
-    columns = {f"x [{unit}]": x, f"y up [{unit}]": y, "row": row, "column": col}
-    for name in field_names(given):
-        columns |= _components(name, field_at(result, name, points, given), unit)
-    return columns
+        in_space(result.mesh, fields).write(temporary, file_format="vtu")
 
 
 def _components(name: str, values: FloatArray, unit: str) -> dict[str, FloatArray]:
@@ -171,14 +147,17 @@ def _components(name: str, values: FloatArray, unit: str) -> dict[str, FloatArra
 
 
 def write_csv(
-    path: Path | str,
-    result: NodalResult,
-    points: FloatArray | None = None,
-    unit: str = "mm",
-    given: Given = NO_MORE,
+    path: Path | str, result: NodalResult, points: FloatArray | None = None, given: Given = NO_MORE
 ) -> None:
-    """Write all fields at points (k, 2) [mm], or at the nodes, as CSV, atomically."""
-    columns = columns_at(result, points, unit, given)
+    """Write all fields at points (k, 2) [mm], or at the nodes, as CSV, atomically.
+
+    NaN beside the mesh.
+    """
+    x, y = (result.mesh.nodes if points is None else np.asarray(points, dtype=np.float64)).T
+    row, col = result.grid.to_px(x, y)
+    columns = {f"x [{given.unit}]": x, f"y up [{given.unit}]": y, "row": row, "column": col}
+    for name in field_names(given):
+        columns |= _components(name, field_at(result, name, points, given), given.unit)
     table = np.column_stack(list(columns.values()))
     with atomic(path) as temporary:
         np.savetxt(temporary, table, "%.9g", ",", header=",".join(columns), comments="")
@@ -187,7 +166,6 @@ def write_csv(
 def write_maps(
     stem: Path,
     result: NodalResult,
-    unit: str = "mm",
     names: Sequence[str] = ("displacement", "standard_deviation", "logarithmic"),
     given: Given = NO_MORE,
 ) -> tuple[Path, ...]:
@@ -199,7 +177,7 @@ def write_maps(
     paths = []
     for name in names:
         values = field_at(result, name, result.grid, given)
-        for label, component in _components(name, values, unit).items():
+        for label, component in _components(name, values, given.unit).items():
             plain = label.replace(" up", "").replace(" [", "_").replace("]", "")
             paths.append(stem.with_name(f"{stem.name}_{plain}.tif"))
             write_image(paths[-1], component)

@@ -25,7 +25,7 @@ from modeharvest.idic.finite_element.cutoff import (
     least_risk,
     risk,
 )
-from modeharvest.idic.finite_element.mesh import quadratic
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import (
     NONE_CONTINUED,
     ContinuedPixels,
@@ -127,13 +127,14 @@ class FiniteElementOptions:
             require_within(f"{what} cutoff_px", self.cutoff_px, 0.0, above=True)
 
 
-Start = Callable[[FloatArray], FloatArray]
-"""Gives displacements (n, 2) [mm] at points (n, 2) [mm]."""
+Start = Result | Callable[[FloatArray], FloatArray] | FloatArray
+"""A correlation's result, what gives displacements (n, 2) at points (n, 2), or those at the nodes
+[mm]."""
 
 
 def measure_displacement(
     pair: ImagePair,
-    start: Result | Start,
+    start: Start,
     on: Mesh | Body | None = None,
     *,
     options: FiniteElementOptions | None = None,
@@ -154,7 +155,7 @@ def measure_displacement(
     options : how to measure.
     progress : listener.
     """
-    course = _Measurement.of(pair, start, on, options or FiniteElementOptions())
+    course = _Measurement(pair, start, on, options or FiniteElementOptions())
     count = len(course.options.stages) + 1
     for k, stage in enumerate(course.options.stages):
         progress(k, count, "whole displacement")
@@ -166,10 +167,10 @@ def measure_displacement(
 
 
 def coarse_displacement(
-    pair: ImagePair, start: Result | Start, on: Body, *, options: FiniteElementOptions
+    pair: ImagePair, start: Start, on: Body, *, options: FiniteElementOptions
 ) -> FloatArray:
     """(n, 2) u [mm] after the stages before the last; for the rest see `measure_displacement`."""
-    course = _Measurement.of(pair, start, on, options)
+    course = _Measurement(pair, start, on, options)
     for stage in options.stages:
         course.through(stage)
     return course.u.reshape(-1, 2)
@@ -182,10 +183,8 @@ class _LevelOnMesh:
     level: Level
     images: LevelPair
     pixels: ElementPixels
-    share: float = 0.0
-    """Of the reference's gradient in what weighs the residual [-]."""
     blur: float = 0.0
-    """Of the image whose gradient that is [px]."""
+    """Of the reference whose gradient weighs the residual [px]."""
     slope_noise: float = 0.0
     """Variance of that gradient by noise [grey levels^2/mm^2]."""
     continued: ContinuedPixels = NONE_CONTINUED
@@ -195,11 +194,25 @@ class _Measurement:
     """A measurement on its way: the images of a stage, the displacement of the nodes."""
 
     def __init__(
-        self, pair: ImagePair, body: Body, start: FloatArray, options: FiniteElementOptions
+        self, pair: ImagePair, start: Start, on: Mesh | Body | None, options: FiniteElementOptions
     ) -> None:
-        self.pair, self.body, self.start, self.options = pair, body, start, options
-        self.prior: Smoothness | Imbalance = Smoothness(body, start)
-        self.u = start.ravel().copy()
+        if on is None:
+            sizes = options.element_px, options.edge_element_px
+            on = Body(*mesh_of_mask(pair.masks[0], pair.grid, *sizes))
+        body = on if isinstance(on, Body) else Body(quadratic(on))
+        nodes = body.mesh.nodes
+        if isinstance(start, Result):
+            start = start.ansatz.displacement_at(start.unknowns, nodes)
+        begin = np.asarray(start(nodes) if callable(start) else start, dtype=np.float64)
+        if begin.shape != nodes.shape or not np.isfinite(begin).all():
+            raise InputError(
+                f"expected a start of finite displacements {nodes.shape} at the nodes, got "
+                f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
+            )
+        pair = pair if body.mask is None else replace(pair, mask=pair.masks[0] & body.mask)
+        self.pair, self.body, self.start, self.options = pair, body, begin, options
+        self.prior: Smoothness | Imbalance = Smoothness(body, begin)
+        self.u = begin.ravel().copy()
         self.history: list[Step] = []
         self.laps: dict[str, float] = {}
         self._last = time.perf_counter()
@@ -211,30 +224,6 @@ class _Measurement:
         self.warnings = body.changes
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = options.order or spline_order(self.speckle_px)
-
-    @classmethod
-    def of(
-        cls, pair: ImagePair, start: Result | Start, on: Mesh | Body | None,
-        options: FiniteElementOptions,
-    ) -> _Measurement:  # fmt: skip
-        """From a start; on a mesh of the pair's mask if there is none."""
-        if on is None:
-            sizes = options.element_px, options.edge_element_px
-            on = Body.of_mask(pair.masks[0], pair.grid, *sizes)
-        body = on if isinstance(on, Body) else Body(quadratic(on))
-        nodes = body.mesh.nodes
-        begin = (
-            start.ansatz.displacement_at(start.unknowns, nodes)
-            if isinstance(start, Result)
-            else np.asarray(start(nodes), dtype=np.float64)
-        )
-        if begin.shape != nodes.shape or not np.isfinite(begin).all():
-            raise InputError(
-                f"expected a start of finite displacements {nodes.shape} at the nodes, got "
-                f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
-            )
-        pair = pair if body.mask is None else replace(pair, mask=pair.masks[0] & body.mask)
-        return cls(pair, body, begin, options)
 
     def _lap(self, step: str) -> None:
         now = time.perf_counter()
@@ -265,7 +254,7 @@ class _Measurement:
             _, d_row, d_col = spline.sample(on.pixels.row, on.pixels.col)
         slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
         return replace(
-            on, pixels=on.pixels._replace(slope=slope), share=1.0, blur=blur,
+            on, pixels=on.pixels._replace(slope=slope), blur=blur,
             slope_noise=noise * slope_noise(self.order, blur) / px**2,
             continued=continued_pixels(self.pair, noise),
         )  # fmt: skip
@@ -275,27 +264,23 @@ class _Measurement:
         on, kept, body = self.level, self.kept, self.body
         assert on is not None
         nodal, is_new = self.u.reshape(-1, 2), kept is None
-        found = normal_equations(
-            on.pixels, body.mesh, on.images, nodal, on.share, on.continued, is_new
-        )
-        if found.pixels == 0:
+        sums = normal_equations(on.pixels, body.mesh, on.images, nodal, on.continued, is_new)
+        if sums.pixels == 0:
             raise InputError("expected pixels of the material in both images, got none in common")
         R, penalty = self.prior.linearised(self.u)
         if kept is None:
-            blocks, share = found.weighed(on.slope_noise)
+            signal = sums.signal(on.slope_noise)
+            blocks = signal[:, None, None, None] ** 2 * sums.blocks
             M = body.matrix(blocks)
             ratio = body.energies(M) / body.energies(R)
         else:
-            blocks, M, share, ratio = kept.blocks, kept.M, kept.share, kept.ratio
-        gradient = body.vector(share[:, None, None] * found.gradient)
-        mean = found.squares / np.maximum(found.counts, 1.0)
-        least = np.finfo(np.float64).tiny
-        excess = np.maximum(mean * found.pixels / max(found.square_sum, least), 1.0)
+            blocks, M, signal, ratio = kept.sums.blocks, kept.M, kept.signal, kept.ratio
+        gradient = body.vector(signal[:, None, None] * sums.gradient)
         self._lap("pixels")
+        sums = replace(sums, blocks=blocks)
         self.kept = Linearised(
-            body, self.prior, self.u, M, gradient, found.square_sum, found.pixels, blocks, share,
-            excess, R, penalty, ratio,
-        )  # fmt: skip
+            body, self.prior, self.u, sums, signal, M, gradient, R, penalty, ratio
+        )
         return self.kept
 
     def through(self, stage: Stage, tolerance_px: float | None = None) -> None:
@@ -313,10 +298,8 @@ class _Measurement:
             share = np.minimum(1.0, self.options.longest_step_px / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
             rms = float(np.sqrt(np.mean(length**2)))
-            residual = float(np.sqrt(at.square_sum / at.pixels))
-            self.history.append(
-                Step(stage.level, stage.cutoff_px, number, residual, rms, float(length.max()))
-            )
+            longest, residual = float(length.max()), at.sums.rms
+            self.history.append(Step(stage.level, stage.cutoff_px, number, residual, rms, longest))
             if not self.prior.is_linear or rms > min(_SHORT_PX, 0.5 * last):
                 self.kept = None
             last = rms
@@ -377,8 +360,8 @@ class _Measurement:
         self.through(Stage(FULL, cutoff), self.options.tolerance_px)
         self.cutoff_px = cutoff
 
-    def _transfer(self) -> NoiseTransfer:
-        """What of the deformed image's noise reaches the residual, at the elements' middles."""
+    def _excess(self) -> float:
+        """What noise has at long wavelengths over its variance in the residual [-]."""
         mesh, u = self.body.mesh, self.u.reshape(-1, 2)
         N, local = (make(mesh.element, np.full((1, 2), 1.0 / 3.0))[0]
                     for make in (shape_functions, shape_gradients))  # fmt: skip
@@ -387,11 +370,7 @@ class _Measurement:
             np.einsum("eki,kj->eij", X, local)
         )
         middle = np.einsum("k,eki->ei", N, u[mesh.cells]) / self.pair.grid.pixel_size
-        return NoiseTransfer.at(middle, det, self.order)
-
-    def _excess(self) -> float:
-        """What noise has at long wavelengths over its variance in the residual [-]."""
-        transfer = self._transfer()
+        transfer = NoiseTransfer.at(middle, det, self.order)
         return (1.0 + transfer.density) / (1.0 + transfer.value)
 
     def result(self) -> NodalResult:
@@ -405,9 +384,8 @@ class _Measurement:
             )
         self._lap("standard deviations")
         on = self._prepare(FULL)
-        outside = int(on.pixels.start[-1]) - at.pixels
         counts = np.diff(on.pixels.start)
-        blank = float(counts[at.share == 0.0].sum() / counts.sum())
+        blank = float(counts[at.signal == 0.0].sum() / counts.sum())
         if blank > _BLANK:
             self.warnings += (
                 f"{100 * blank:.0f} % of the material shows no speckle: there the displacement is "
@@ -423,10 +401,10 @@ class _Measurement:
             grid=self.pair.grid,
             cutoff_px=self.cutoff_px,
             tried=self.tried,
-            residual_rms=float(np.sqrt(at.square_sum / at.pixels)),
+            residual_rms=at.sums.rms,
             residual_noise=here.noise,
-            pixels=at.pixels,
-            outside=outside,
+            pixels=at.sums.pixels,
+            outside=at.sums.outside,
             effective_unknowns=here.unknowns,
             blur_px=on.blur,
             library=self.body.library,

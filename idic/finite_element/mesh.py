@@ -54,19 +54,22 @@ Loops = tuple[tuple[FloatArray, ...], ...]
 one curve ends."""
 
 
-class Meshable(NamedTuple):
-    """What of a mask can be meshed."""
+class MeshedMaterial(NamedTuple):
+    """What of a mask is measured."""
 
+    mesh: Mesh
+    """T6 [mm, or px where the size of a pixel isn't known]."""
     mask: BoolArray
-    """(rows, cols) True on material that elements fit on."""
+    """(rows, cols) True on material that the mesh covers."""
     changes: tuple[str, ...]
-    """What was left out or filled, in sentences."""
+    """What of the mask was left out or filled, in sentences."""
 
 
-def meshable(mask: BoolArray, element_px: float) -> Meshable:
+def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, ...]]:
     """Fill the holes, and leave out islands and ligaments, that elements of so many px don't fit.
 
-    ``element_px``: edge length along edges [px].
+    Returns the mask of what is left, and what was changed, in sentences; ``element_px``: edge
+    length along edges [px].
     """
     changes = []
     kept = mask | ~_large(~mask, _LEAST_HOLE * element_px**2)
@@ -100,7 +103,7 @@ def meshable(mask: BoolArray, element_px: float) -> Meshable:
             f"{'; ...' if count > len(where) else ''}."
         )
         kept = large
-    return Meshable(kept, tuple(changes))
+    return kept, tuple(changes)
 
 
 def _opened(mask: BoolArray, radius: float) -> BoolArray:
@@ -120,9 +123,9 @@ def _large(mask: BoolArray, least_px: float) -> BoolArray:
 
 
 def mesh_of_mask(
-    mask: BoolArray, grid: PixelGrid, element_px: float, edge_element_px: float | None = None
-) -> Mesh:
-    """Make a T6 mesh [mm] of the material in a mask, elements of so many px.
+    mask: BoolArray, grid: PixelGrid, element_px: float, edge_element_px: float
+) -> MeshedMaterial:
+    """Mesh what can be meshed of a mask (rows, cols), elements of so many px inside and at edges.
 
     InputError if there is no island of at least four elements, or gmsh isn't there.
     """
@@ -131,24 +134,26 @@ def mesh_of_mask(
             "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
             "mesh"
         )
+    kept, changes = meshable(mask, edge_element_px)
     # Elements longer than a ligament is wide would make chords of its two edges cross.
-    edge = min(edge_element_px or element_px, _narrowest(mask))
+    edge = min(edge_element_px, _narrowest(kept))
     if edge < _NARROWEST_PX:
         raise InputError(
             f"expected material at least {_NARROWEST_PX:g} px wide between holes, got {edge:.1f} "
             "px; take images of more pixels, or fill the holes in the mask"
         )
-    parts = outlines(mask, edge)
+    parts = outlines(kept, edge)
     if not parts:
         raise InputError(
             f"expected a mask with material for elements of {element_px:g} px, got "
-            f"{int(mask.sum())} px of it, in islands smaller than four elements; check the mask"
+            f"{int(kept.sum())} px of it, in islands smaller than four elements; check the mask"
         )
-    nodes, cells = _meshed_in_child(parts, element_px, edge, int(mask.sum()))
+    nodes, cells = _meshed_in_child(parts, element_px, edge, int(kept.sum()))
     x, y = grid.to_mm(-nodes[:, 1], nodes[:, 0])
     over = (_twice_area(nodes, cells) < 0.0)[:, None]
     cells = np.where(over, cells[:, _REVERSED["T6"]], cells)
-    return quadratic(Mesh(np.stack([x, y], axis=1), cells, "T6"))
+    mesh = quadratic(Mesh(np.stack([x, y], axis=1), cells, "T6"))
+    return MeshedMaterial(mesh, kept, changes)
 
 
 def _meshed_in_child(

@@ -143,7 +143,7 @@ def _continue(
         out[i, j] = b[0] / A[0, 0]
 
 
-_LEAST_SHARE = 0.5
+_LEAST_SIGNAL = 0.5
 """Of signal in the slopes of an element; with less than that they may be nothing but noise."""
 
 
@@ -240,16 +240,27 @@ class NodalEquations:
         """How many that is over."""
         return int(self.counts.sum())
 
-    def weighed(self, noise: float) -> tuple[FloatArray, FloatArray]:
-        """The blocks, each element weighed by its share of signal (m,) from 0 to 1; and that.
+    @property
+    def rms(self) -> float:
+        """Of r [grey levels]."""
+        return float(np.sqrt(self.square_sum / self.pixels))
+
+    @property
+    def excess(self) -> FloatArray:
+        """(m,) mean of r^2 in an element over that in all, at least 1 [-]."""
+        mean, least = self.squares / np.maximum(self.counts, 1.0), np.finfo(np.float64).tiny
+        return np.asarray(np.maximum(mean * self.pixels / max(self.square_sum, least), 1.0))
+
+    def signal(self, noise: float) -> FloatArray:
+        """(m,) share of each element's slopes that is signal, from 0 to 1.
 
         ``noise``: variance of the slopes h that is noise [grey levels^2/mm^2]. Such slopes show no
         displacement: of a sum of h h' only that share is what an element's residual changes by.
         """
         slopes = self.blocks[:, [0, 2]].sum(axis=(1, 2, 3))  # shape functions sum to 1
-        share = 1.0 - 2.0 * noise * self.weights / np.maximum(slopes, np.finfo(np.float64).tiny)
-        share[(share < _LEAST_SHARE) | (slopes <= 0.0)] = 0.0
-        return share[:, None, None, None] ** 2 * self.blocks, share
+        signal = 1.0 - 2.0 * noise * self.weights / np.maximum(slopes, np.finfo(np.float64).tiny)
+        signal[(signal < _LEAST_SIGNAL) | (slopes <= 0.0)] = 0.0
+        return np.asarray(signal)
 
 
 def normal_equations(
@@ -257,7 +268,6 @@ def normal_equations(
     mesh: Mesh,
     level: LevelPair,
     u: FloatArray,
-    share: float,
     continued_in_g: ContinuedPixels = NONE_CONTINUED,
     with_blocks: bool = True,
 ) -> NodalEquations:
@@ -265,12 +275,11 @@ def normal_equations(
 
     Parameters
     ----------
-    pixels : of the level's reference.
+    pixels : of the level's reference, whose gradient there, pushed forward, weighs the residual;
+        if they have none, that of the deformed image at x + u.
     mesh : T6.
     level : whose deformed image is sampled.
     u : (n, 2) displacement of the nodes [mm].
-    share : of the reference's gradient, pushed forward, in what weighs the residual; the rest is
-        that of the deformed image at x + u [-].
     continued_in_g : pixels of the deformed image that are continued, by which residuals weigh.
     with_blocks : whether the blocks are needed, which take most of the time.
     """
@@ -278,7 +287,7 @@ def normal_equations(
     blocks = np.zeros((m if with_blocks else 0, 3, 6, 6))
     gradient, sums = np.zeros((m, 6, 2)), np.zeros((m, 4))
     valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
-    g = level.deformed
+    g, share = level.deformed, 1.0 if pixels.slope.size else 0.0
     in_parallel(
         accumulate_elements, pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order,
         valid, *continued_in_g, level.grid.pixel_size, share, blocks, gradient, sums,

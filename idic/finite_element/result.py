@@ -178,8 +178,8 @@ def _continue(
     there = located.mask
     distance, nearest = ndimage.distance_transform_edt(~there, return_indices=True)
     rows, cols = np.nonzero((distance > 0.0) & (distance <= _BEYOND_PX))
-    near = tuple(nearest[:, rows, cols])
-    element, xi = located_at(mesh, grid, near, located.element, (rows, cols))
+    element = located.element[tuple(nearest[:, rows, cols])]
+    xi = _local_coordinates(mesh, element, np.stack(grid.to_mm(rows, cols), axis=1))
     for begin in range(0, rows.size, _CHUNK):
         part = np.s_[begin : begin + _CHUNK]
         N, own = shape_functions(mesh.element, xi[part]), nodal[mesh.cells[element[part]]]
@@ -190,23 +190,15 @@ def _continue(
         values[:, rows[part], cols[part]] = found.T
 
 
-def located_at(
-    mesh: Mesh,
-    grid: PixelGrid,
-    near: tuple[NDArray[Any], ...],
-    elements: NDArray[Any],
-    at: tuple[NDArray[Any], NDArray[Any]],
-) -> tuple[NDArray[Any], FloatArray]:
-    """Elements and local coordinates, outside their element, of pixels beside the mesh."""
-    element = elements[near]
-    target = np.stack(grid.to_mm(*at), axis=1)
+def _local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
+    """(k, 2) of points (k, 2) [mm] in elements (k,) that they are beside."""
     x = mesh.nodes[mesh.cells[element]]
-    xi = np.full((element.size, 2), 1.0 / 3.0)
+    xi: FloatArray = np.full((element.size, 2), 1.0 / 3.0)
     for _ in range(8):
-        off = np.einsum("ka,kai->ki", shape_functions(mesh.element, xi), x) - target
+        off = np.einsum("ka,kai->ki", shape_functions(mesh.element, xi), x) - points
         F = np.einsum("kai,kaj->kij", x, shape_gradients(mesh.element, xi))
         step = np.linalg.solve(F, off[..., None])[..., 0]
         xi = np.clip(xi - step, -1.0, 2.0)
         if abs(step).max(initial=0.0) < 1e-12:  # in local coordinates: settled
             break
-    return element, xi
+    return xi

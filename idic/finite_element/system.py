@@ -33,9 +33,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable
-from modeharvest.idic.finite_element.pixels import MeshPixels
-from modeharvest.imaging.grid import PixelGrid
+from modeharvest.idic.finite_element.pixels import MeshPixels, NodalEquations
 from modeharvest.imaging.mapping.elements import reference_element, shape_gradients
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
@@ -150,30 +148,19 @@ def second_gradients(mesh: Mesh) -> FloatArray:
     return np.asarray(found.mean(axis=1))
 
 
-def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Jumps of the gradient across interior sides.
+def _on_sides(
+    mesh: Mesh, cells: IntArray, sides: IntArray, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gradients of the shape functions on sides of cells (s,), and how fast these are gone along.
 
-    Returns
-    -------
-    nodes, jumps, weights
-        (s, 2 k) node numbers of both cells, (s, g, 2 k, 2) jump of the gradient for each of them
-        [1/mm] at Gauss points, (s, g) lengths that these stand for, over that of the side [-].
+    ``at`` (g,): of a side, from 0 to 1. Returns (s, g, k, 2) [1/mm] and (s, g) [mm].
     """
     corners = reference_element(mesh.element).nodes[:3]
-    parts, weights = [], np.empty(0)
-    for sign, cell, side, forwards in ((1.0, 0, 1, True), (-1.0, 2, 3, False)):
-        begin, end = corners[sides[:, side]], corners[(sides[:, side] + 1) % 3]
-        t = _GAUSS if forwards else 1.0 - _GAUSS  # the other cell goes the other way
-        at = begin[:, None] + t[:, None] * (end - begin)[:, None]
-        local = shape_gradients(mesh.element, at)  # (s, g, k, 2)
-        x = mesh.nodes[mesh.cells[sides[:, cell]]]
-        F = np.einsum("ski,sgkj->sgij", x, local)
-        parts.append(sign * np.einsum("sgkj,sgji->sgki", local, np.linalg.inv(F)))
-        if forwards:
-            along = np.linalg.norm(np.einsum("sgij,sj->sgi", F, end - begin), axis=-1)
-            weights = 0.5 * along / along.mean(axis=1, keepdims=True)
-    nodes = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
-    return nodes, np.concatenate(parts, axis=2), weights
+    begin, along = corners[sides], corners[(sides + 1) % 3] - corners[sides]
+    local = shape_gradients(mesh.element, begin[:, None] + at[:, None] * along[:, None])
+    F = np.einsum("ski,sgkj->sgij", mesh.nodes[mesh.cells[cells]], local)
+    speed = np.linalg.norm(np.einsum("sgij,sj->sgi", F, along), axis=-1)
+    return np.einsum("sgkj,sgji->sgki", local, np.linalg.inv(F)), speed
 
 
 class SmoothnessRoots(NamedTuple):
@@ -188,14 +175,16 @@ class SmoothnessRoots(NamedTuple):
     @classmethod
     def of(cls, mesh: Mesh) -> SmoothnessRoots:
         """Of a T6 mesh."""
-        curved, sides = second_gradients(mesh), interior_sides(mesh.cells)
-        nodes, jumps, shares = side_jumps(mesh, sides)
-        first, side, second, _ = sides.T
-        x = mesh.nodes[mesh.cells[first]]
-        ends = x[np.arange(len(x)), side], x[np.arange(len(x)), (side + 1) % 3]
-        h = np.linalg.norm(ends[1] - ends[0], axis=1)
+        curved, (first, side, second, other) = second_gradients(mesh), interior_sides(mesh.cells).T
+        here, speed = _on_sides(mesh, first, side, _GAUSS)
+        there, _ = _on_sides(mesh, second, other, 1.0 - _GAUSS)  # which goes the other way
+        shares = 0.5 * speed / speed.mean(axis=1, keepdims=True)
+        corners = mesh.nodes[mesh.cells[first, (side + 1) % 3]], mesh.nodes[mesh.cells[first, side]]
+        h = np.linalg.norm(corners[0] - corners[1], axis=1)
         bent = np.concatenate([curved[first], -curved[second]], axis=1)
+        jumps = np.concatenate([here, -there], axis=2)
         across = np.sqrt(_PENALTY * shares / h[:, None] ** 2)[:, :, None, None] * jumps
+        nodes = np.hstack([mesh.cells[first], mesh.cells[second]])
         second_part, first_part = bent.reshape(*nodes.shape, 4), np.moveaxis(across, 2, 1)
         roots = np.concatenate([second_part, first_part.reshape(*nodes.shape, 4)], axis=2)
         return cls(len(mesh.nodes), nodes, roots)
@@ -213,16 +202,15 @@ class SmoothnessRoots(NamedTuple):
     def samples(self, count: int) -> FloatArray:
         """(2 n, count) random vectors whose covariance is R of both components [1/mm^2]."""
         shape = len(self.roots), self.roots.shape[2], 2 * count
-        total = np.zeros((self.size, 2 * count))
-        add_at(total, self.nodes, self.roots @ np.random.default_rng(1).standard_normal(shape))
-        return total.reshape(2 * self.size, count)
+        random = self.roots @ np.random.default_rng(1).standard_normal(shape)
+        return nodal_sums(self.size, self.nodes, random).reshape(2 * self.size, count)
 
 
-def add_at(total: FloatArray, nodes: IntArray, values: FloatArray) -> None:
-    """Add values (m, k, s) to the rows of (n, s) whose numbers are (m, k)."""
+def nodal_sums(count: int, nodes: IntArray, values: FloatArray) -> FloatArray:
+    """(count, s) sums of values (m, k, s) over the nodes (m, k) that they belong to."""
     flat = nodes.ravel()
-    ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (len(total), flat.size))
-    total += ones @ values.reshape(flat.size, total.shape[1])
+    ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (count, flat.size))
+    return np.asarray(ones @ values.reshape(flat.size, values.shape[2]))
 
 
 class Body:
@@ -234,10 +222,8 @@ class Body:
         self.mesh, self.pixels = mesh, MeshPixels(mesh)
         self.mask, self.changes = mask, changes
         """(rows, cols) True on pixels that count, None for those of any mask; what was left out."""
-        sides = interior_sides(mesh.cells)
-        pairs = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
-        self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, pairs)
         roots = SmoothnessRoots.of(mesh)
+        self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, roots.nodes)
         self.smoothness = self.pattern.both(roots.matrix())
         self.smoothness_samples = roots.samples(SAMPLES)
         edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
@@ -247,17 +233,6 @@ class Body:
         self._factor: Factor | None = None
         self._factorised: tuple[csr_array, csr_array, float] | None = None
         self._stored = 0
-
-    @classmethod
-    def of_mask(
-        cls, mask: BoolArray, grid: PixelGrid, element_px: float, edge_element_px: float
-    ) -> Body:
-        """On what can be meshed of a mask (rows, cols), elements of so many px inside and at edges.
-
-        InputError as :func:`modeharvest.idic.finite_element.mesh.mesh_of_mask`.
-        """
-        kept, changes = meshable(mask, edge_element_px)
-        return cls(mesh_of_mask(kept, grid, element_px, edge_element_px), kept, changes)
 
     @property
     def library(self) -> str:
@@ -270,9 +245,7 @@ class Body:
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """(2 n,) of the parts (m, 6, 2) of the elements."""
-        total = np.zeros((len(self.mesh.nodes), 2))
-        add_at(total, self.mesh.cells, parts)
-        return total.ravel()
+        return nodal_sums(len(self.mesh.nodes), self.mesh.cells, parts).ravel()
 
     def energies(self, matrix: csr_array) -> float:
         """Sum of v'Av over some waves v."""
@@ -307,9 +280,7 @@ class Body:
         M[:, range(12), range(12)] *= 1.0 + 1e-9
         M[:, range(12), range(12)] += 1e-12 * M.max()
         z = np.linalg.cholesky(M) @ np.random.default_rng(0).standard_normal((m, 12, count))
-        total = np.zeros((n, 2 * count))
-        add_at(total, self.mesh.cells, z.reshape(m, 6, 2 * count))
-        return total.reshape(2 * n, count)
+        return nodal_sums(n, self.mesh.cells, z.reshape(m, 6, 2 * count)).reshape(2 * n, count)
 
 
 def _waves(nodes: FloatArray, wavelength: float) -> FloatArray:
@@ -399,18 +370,13 @@ class Linearised:
     """What regularises."""
     u: FloatArray
     """(2 n,) [mm]."""
+    sums: NodalEquations
+    """Over the pixels; the blocks weighed, and perhaps of another displacement close by."""
+    signal: FloatArray
+    """(m,) see :meth:`NodalEquations.signal`; its square weighs the blocks."""
     M: csr_array
     gradient: FloatArray
-    """(2 n, 2 n) and (2 n,): sums of h h' and of h r."""
-    square_sum: float
-    pixels: int
-    """Sum of r^2, and how many pixels it is over."""
-    blocks: FloatArray
-    """(m, 3, 6, 6) parts of M, element by element."""
-    share: FloatArray
-    """(m,) of each element's slopes that is signal, not noise [-]."""
-    excess: FloatArray
-    """(m,) mean of r^2 in an element over that in all, at least 1 [-]."""
+    """(2 n, 2 n) and (2 n,): sums of h h' and of h r, so weighed."""
     R: csr_array
     penalty: FloatArray
     """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""

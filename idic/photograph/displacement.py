@@ -7,7 +7,6 @@ reference a first measurement gives that of the deformed image.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,27 +66,6 @@ _OFF_PX = 4.0, 1.0
 """By how much edges may be off where blocks of speckle, and a first measurement, say they are."""
 
 
-def photographed_displacement(
-    pair: ImagePair,
-    body: Body,
-    before: NodalResult | None = None,
-    names: tuple[str, str] = ("the reference", "the deformed image"),
-    progress: Progress = silent,
-) -> NodalResult:
-    """Measure the displacement of a photograph on a mesh, from the images alone.
-
-    InputError if the images don't show the same surface, or don't overlap; and as for
-    :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
-
-    pair : Reference and deformed image, the mask of the reference. Their brightness may differ.
-    body : The material's mesh.
-    before : What was found in the image before, on the same mesh.
-    names : Of the two images, for messages.
-    """
-    start = block_motion(pair, body.mesh, before, names)
-    return displacement_from(start, pair, body, progress=progress)
-
-
 def displacement_from(
     start: FloatArray,
     pair: ImagePair,
@@ -97,22 +75,17 @@ def displacement_from(
 ) -> NodalResult:
     """Measure the displacement of a photograph on a mesh, from a start (n, 2) at its nodes [mm].
 
-    For the others see :func:`photographed_displacement`.
+    ``pair``: the mask of the reference; brightness may differ. InputError if the images don't
+    overlap; and as for :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
     """
-    mesh, begin = body.mesh, partial(_known, start)
+    mesh = body.mesh
     pair = _alike(pair, mesh, start)
     if pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None:
         inner = replace(pair, deformed_mask=deformed_mask(pair.grid, mesh, start, _OFF_PX[0]))
-        first = coarse_displacement(inner, begin, body, options=_FIRST)
+        first = coarse_displacement(inner, start, body, options=_FIRST)
         mask = deformed_mask(pair.grid, mesh, first, _OFF_PX[1])
         pair = replace(_alike(pair, mesh, first), deformed_mask=mask)
-    return measure_displacement(pair, begin, body, options=options, progress=progress)
-
-
-def _known(values: FloatArray, points: FloatArray) -> FloatArray:
-    """Values that are known at the points that are asked for."""
-    assert values.shape == points.shape, "a T6 mesh keeps its nodes"
-    return values
+    return measure_displacement(pair, start, body, options=options, progress=progress)
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:

@@ -19,20 +19,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from modeharvest.fem.field import Mesh, read_mesh, read_plane_mesh, write_mesh
-from modeharvest.idic.finite_element import files as nodal_files
+from modeharvest.idic.finite_element.files import (
+    Given,
+    read_result,
+    write_csv,
+    write_maps,
+    write_result,
+    write_vtu,
+)
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
+from modeharvest.idic.finite_element.mesh import MeshedMaterial, mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.displacement import (
+    block_motion,
     brightness,
+    displacement_from,
     is_misfit,
-    photographed_displacement,
     residual,
     speckled,
 )
@@ -105,16 +113,6 @@ class MeasureCase:
         return "px" if self.pixel_size is None else "mm"
 
 
-class MeshedMaterial(NamedTuple):
-    """What is measured."""
-
-    mask: BoolArray
-    mesh: Mesh
-    """(rows, cols) where the material is, and its T6 mesh [mm or px]."""
-    warnings: tuple[str, ...]
-    """What of the mask that was given, or found, is not measured."""
-
-
 @dataclass(frozen=True)
 class MeasureRun(StagedRun[MeasureCase]):
     """The stages of a measurement."""
@@ -154,7 +152,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             found = self._material() if self.case.mesh is None else self._meshed(self.case.mesh)
             write_image(mask_path, found.mask)
             with atomic_hdf5(mesh_path) as file:
-                warnings = json.dumps(found.warnings)
+                warnings = json.dumps(found.changes)
                 file.attrs.update(format=_MESH_FORMAT, unit=self.case.unit, warnings=warnings)
                 write_mesh(file, found.mesh)
             return mask_path, mesh_path
@@ -162,7 +160,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         self.do("prepare", self._key, work)
         with open_hdf5(mesh_path, "a mesh", "measure again", _MESH_FORMAT) as file:
             warnings = tuple(json.loads(file.attrs["warnings"]))
-            return MeshedMaterial(read_mask(mask_path), read_mesh(file), warnings)
+            return MeshedMaterial(read_mesh(file), read_mask(mask_path), warnings)
 
     @cached_property
     def _body(self) -> Body:
@@ -172,9 +170,8 @@ class MeasureRun(StagedRun[MeasureCase]):
         """What can be measured of the mask that is given, or is found by its speckle."""
         given, options, image = self._given_mask, FiniteElementOptions(), self.reference.image
         mask, blank = speckled(image, find_material(image).mask if given is None else given)
-        kept, changes = meshable(mask, options.edge_element_px)
-        mesh = mesh_of_mask(kept, self.grid, options.element_px, options.edge_element_px)
-        return MeshedMaterial(kept, mesh, (*blank, *changes))
+        found = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
+        return found._replace(changes=(*blank, *found.changes))
 
     def _meshed(self, path: Path) -> MeshedMaterial:
         """A mesh that is given, and what it covers of the mask, which is all of it if there is one.
@@ -210,7 +207,7 @@ class MeasureRun(StagedRun[MeasureCase]):
                 f"{int(beside.sum())} of {beside.size} elements lie beside the image or the mask "
                 f"and were left out; lengths of the mesh are {here}.",
             )
-        return MeshedMaterial(mask, mesh, warnings)
+        return MeshedMaterial(mesh, mask, warnings)
 
     def pair(self, name: str) -> ImagePair:
         """The reference, a deformed image, and the mask."""
@@ -229,21 +226,21 @@ class MeasureRun(StagedRun[MeasureCase]):
         return found
 
     def _result(self, name: str, key: str, before: NodalResult | None) -> NodalResult:
-        folder, unit = self.folder / "results", self.case.unit
+        folder, given = self.folder / "results", Given(self.case.unit)
         tables = [folder / f"{name}.{kind}" for kind in ("h5", "vtu", "csv")]
 
         def work() -> tuple[Path, ...]:
             names = str(self.case.reference), str(self.case.files[name])
-            result = photographed_displacement(
-                self.pair(name), self._body, before, names, self.progress
-            )
-            nodal_files.write_result(tables[0], result, unit)
-            nodal_files.write_vtu(tables[1], result, unit)
-            nodal_files.write_csv(tables[2], result, unit=unit)
-            return *tables, *nodal_files.write_maps(folder / name, result, unit)
+            pair, body = self.pair(name), self._body
+            start = block_motion(pair, body.mesh, before, names)
+            result = displacement_from(start, pair, body, progress=self.progress)
+            write_result(tables[0], result, given)
+            write_vtu(tables[1], result, given)
+            write_csv(tables[2], result, given=given)
+            return *tables, *write_maps(folder / name, result, given=given)
 
         self.do(f"image {name}", key, work)
-        return nodal_files.read_result(tables[0])
+        return read_result(tables[0])
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN off the material."""
@@ -280,7 +277,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "material_px": int(self.material.mask.sum()),
             "mask": "found by its speckle" if case.mask is case.mesh is None else "given",
             "notes": list(self.reference.notes),
-            "warnings": list(self.material.warnings),
+            "warnings": list(self.material.changes),
             "images": [self._image(name, result) for name, result in results.items()],
             "versions": versions(*LIBRARIES),
         }  # fmt: skip

@@ -28,6 +28,7 @@ from modeharvest.idic.finite_element.measure import (
     Law,
     measure_displacement,
 )
+from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
@@ -175,7 +176,8 @@ class WholeFields:
         count = max(1, min(most, int(available_bytes() / (BYTES_PER_PIXEL * mask.size))))
         with _children(count - 1) as children:
             with _with_remedy("mesh of the material"):
-                body = Body.of_mask(mask, images.grid, how.element_px, how.edge_element_px)
+                sizes = how.element_px, how.edge_element_px
+                body = Body(*mesh_of_mask(mask, images.grid, *sizes))
             # The last state takes longest, and its progress is seen.
             first, *others = (
                 partial(
@@ -229,7 +231,7 @@ def _measure(
         return measure_displacement(pair, results[strain], body, options=how, progress=progress)
 
     for strain, result in results.items():
-        of, given = f"strain {100 * strain:.2f} %", Given(law, result)
+        of, given = f"strain {100 * strain:.2f} %", Given(material=law, correlation=result)
         files.measure(name_of(strain), of, partial(one, strain), progress, given)
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.finite_element.files import Given
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
@@ -90,7 +91,7 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
     def _body(self) -> Body:
         how, prepared = self.case.whole_field, self.prepared
         sizes = how.element_px, how.edge_element_px
-        return Body.of_mask(prepared.mask(), prepared.grid, *sizes)
+        return Body(*mesh_of_mask(prepared.mask(), prepared.grid, *sizes))
 
     @cached_property
     def _measured(self) -> tuple[dict[str, WholeField], dict[str, str]]:
@@ -116,7 +117,7 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
                 options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
                 return self._warned(displacement_from(begin, pair, body, options, progress), name)
 
-            given, refit = Given(None, correlated), self._refit(name)
+            given, refit = Given(correlation=correlated), self._refit(name)
             files = self._files.measure(name, name, measured, self.progress, given)
             refitted(self._files.read(name), correlated, self.prepared.mask()).write(refit)
             text = "the result of its correlation" if is_usable else "blocks of the speckle"
