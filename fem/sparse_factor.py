@@ -6,6 +6,8 @@ matrices of a pattern. Without it SciPy's SuperLU does the work, in several time
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any, Protocol
 
 import numpy as np
@@ -35,16 +37,10 @@ def factorise(matrix: csr_array, library: str | None = None) -> Factor:
     here or in an update.
 
     matrix : (n, n), both triangles.
-    library : a name among ``LIBRARIES``; by default the first one that is there.
+    library : a name among ``LIBRARIES``; by default MUMPS if it is there.
     """
-    for kind in LIBRARIES.values() if library is None else [LIBRARIES[library]]:
-        try:
-            found: Factor = kind(matrix)
-            return found
-        except ModuleNotFoundError:
-            if library is not None:
-                raise
-    raise AssertionError("SciPy is always there")
+    best = "mumps" if find_spec("petsc4py") else "superlu"
+    return LIBRARIES[library or best](matrix)
 
 
 class _Mumps:
@@ -71,14 +67,11 @@ class _Mumps:
         self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
         self._factor.setMumpsIcntl(14, 60)  # room for fill-in [%]
         self._vectors = self._matrix.createVecs()
-        self._set_up()
+        self.update(matrix)
 
     def update(self, matrix: csr_array) -> None:
         self._arrays[2][:] = matrix.data
         self._matrix.stateIncrease()
-        self._set_up()
-
-    def _set_up(self) -> None:
         self._pc.setUp()
         code = self._factor.getMumpsInfog(1)
         if code < 0:
@@ -118,5 +111,4 @@ class _SuperLU:
         return np.asarray(self._factor.solve(rhs))
 
 
-LIBRARIES: dict[str, Any] = {"mumps": _Mumps, "superlu": _SuperLU}
-"""In the order in which they are tried."""
+LIBRARIES: dict[str, Callable[[csr_array], Factor]] = {"mumps": _Mumps, "superlu": _SuperLU}

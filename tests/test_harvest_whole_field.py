@@ -230,7 +230,7 @@ def test_where_there_is_no_mesh_the_modes_are_harvested_all_the_same(
     def fail(*_: object) -> None:
         raise InputError("expected wider ligaments")
 
-    monkeypatch.setattr("modeharvest.runs.photographs.whole_field.mesh_of_mask", fail)
+    monkeypatch.setattr("modeharvest.idic.finite_element.measure.mesh_of_mask", fail)
     text = "[whole_field]\nmeasure = true\n"
     found = HarvestRun(PhotographCase.read(experiment(photographs, text)), tmp_path).harvest()
     assert len(found.frames) == 2

@@ -39,7 +39,7 @@ from modeharvest.idic.finite_element.fields import (
     mean_around,
     nodal_gradient,
 )
-from modeharvest.idic.finite_element.system import SAMPLES, Linearised
+from modeharvest.idic.finite_element.system import SAMPLES, Linearised, Smoothness
 from modeharvest.util.arrays import FloatArray, IntArray
 
 _PROBES = 4
@@ -150,13 +150,15 @@ def deviations(at: Linearised, cutoff: float, noise: float, unknowns: float) -> 
     here = at.step(cutoff)
     random = at.body.samples(at.sums.blocks * at.sums.excess[:, None, None, None])
     found = noise * factor.solve(random).reshape(-1, 2, SAMPLES)
-    if at.prior.samples is not None:
+    if isinstance(at.prior, Smoothness):  # what a law allows there is not known
         blank = mean_around(mesh, np.repeat(1.0 - at.signal, 6).reshape(-1, 6))
         # The roughness that was found is that of so many unknowns, or the weight is too large.
         grown = float((at.u - at.prior.start) @ at.penalty)
         rough = weight * grown / max(noise**2 * unknowns, _TINY)
         wide = noise * np.sqrt(weight * blank * max(1.0, rough))
-        found += wide[:, None, None] * factor.solve(at.prior.samples).reshape(-1, 2, SAMPLES)
+        found += wide[:, None, None] * factor.solve(at.body.smoothness_samples).reshape(
+            -1, 2, SAMPLES
+        )
     change = (at.step(cutoff, _STRONGER) - here).reshape(-1, 2)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES

@@ -42,6 +42,7 @@ from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
 from modeharvest.idic.solver.weighting import best_blur
+from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
@@ -67,16 +68,22 @@ _SETTLED = 0.5
 
 
 @dataclass(frozen=True)
-class Stage:
+class _Stage:
     """One stage from coarse to fine."""
 
     level: Level
     """Binning and blur of the images."""
     cutoff_px: float
     """Wavelength of which the regularisation leaves one half [px]."""
+    tolerance_px: float = 0.05
+    """Of the step that ends it, rms over the nodes [px]."""
 
 
-STAGES = (Stage(Level(2, 3.0), 200.0), Stage(Level(2, 1.5), 80.0), Stage(FULL, 40.0))
+_STAGES = (_Stage(Level(2, 3.0), 200.0, 0.4), _Stage(Level(2, 1.5), 80.0, 0.4), _Stage(FULL, 40.0))
+"""Before the last one, which has the unfiltered images, too, and the cut-off that is sought."""
+_LAST_TOLERANCE_PX = 5e-3
+_LONGEST_STEP_PX = 8.0
+"""Of a node, in one step."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +103,6 @@ class FiniteElementOptions:
     element_px: float = 24.0
     edge_element_px: float = 12.0
     """Edge length of the elements inside and along edges, where the mesh is to be made [px]."""
-    stages: tuple[Stage, ...] = STAGES
-    """Before the last one, which has the unfiltered images and ``cutoff_px``."""
     cutoff_px: float | None = None
     """Cut-off wavelength of the last stage [px]; None for the one with the least estimated risk."""
     law: Law | None = None
@@ -105,15 +110,8 @@ class FiniteElementOptions:
     edge_px: int = 0
     """Pixels closer than this to the edge of the mask are left out of the unfiltered images [px].
     """
-    order: int | None = None
-    """Of the spline: 3, 5 or 11; by default as in a correlation."""
     steps: int = 4
     """Of Gauss-Newton in each stage, at most."""
-    tolerance_px: float = 5e-3
-    """The last stage ends with a step shorter than that, those before with ten times that, or on
-    blurred images with 80 times [px]; rms over the nodes."""
-    longest_step_px: float = 8.0
-    """Of a node [px]."""
 
     def __post_init__(self) -> None:
         what = "finite-element DIC: expected"
@@ -121,10 +119,12 @@ class FiniteElementOptions:
         require_within(f"{what} edge_element_px", self.edge_element_px, 4.0)
         require_within(f"{what} edge_px", self.edge_px, 0)
         require_within(f"{what} steps", self.steps, 1)
-        require_within(f"{what} longest_step_px", self.longest_step_px, 0.0, above=True)
-        require_within(f"{what} tolerance_px", self.tolerance_px, 0.0, above=True)
         if self.cutoff_px is not None:
             require_within(f"{what} cutoff_px", self.cutoff_px, 0.0, above=True)
+
+    def body(self, mask: BoolArray, grid: PixelGrid) -> Body:
+        """What can be meshed of a mask (rows, cols); InputError as for ``mesh_of_mask``."""
+        return Body(*mesh_of_mask(mask, grid, self.element_px, self.edge_element_px))
 
 
 Start = Result | Callable[[FloatArray], FloatArray] | FloatArray
@@ -156,8 +156,8 @@ def measure_displacement(
     progress : listener.
     """
     course = _Measurement(pair, start, on, options or FiniteElementOptions())
-    count = len(course.options.stages) + 1
-    for k, stage in enumerate(course.options.stages):
+    count = len(_STAGES) + 1
+    for k, stage in enumerate(_STAGES):
         progress(k, count, "whole displacement")
         course.through(stage)
     progress(count - 1, count, "whole displacement")
@@ -171,7 +171,7 @@ def coarse_displacement(
 ) -> FloatArray:
     """(n, 2) u [mm] after the stages before the last; for the rest see `measure_displacement`."""
     course = _Measurement(pair, start, on, options)
-    for stage in options.stages:
+    for stage in _STAGES:
         course.through(stage)
     return course.u.reshape(-1, 2)
 
@@ -197,8 +197,7 @@ class _Measurement:
         self, pair: ImagePair, start: Start, on: Mesh | Body | None, options: FiniteElementOptions
     ) -> None:
         if on is None:
-            sizes = options.element_px, options.edge_element_px
-            on = Body(*mesh_of_mask(pair.masks[0], pair.grid, *sizes))
+            on = options.body(pair.masks[0], pair.grid)
         body = on if isinstance(on, Body) else Body(quadratic(on))
         nodes = body.mesh.nodes
         if isinstance(start, Result):
@@ -223,7 +222,7 @@ class _Measurement:
         self.tried: tuple[Risk, ...] = ()
         self.warnings = body.changes
         self.speckle_px = speckle_size(pair.reference, pair.mask)
-        self.order = options.order or spline_order(self.speckle_px)
+        self.order = spline_order(self.speckle_px)
 
     def _lap(self, step: str) -> None:
         now = time.perf_counter()
@@ -283,28 +282,24 @@ class _Measurement:
         )
         return self.kept
 
-    def through(self, stage: Stage, tolerance_px: float | None = None) -> None:
+    def through(self, stage: _Stage) -> None:
         """Take steps until they are short."""
         self._prepare(stage.level)
-        px = self.pair.grid.pixel_size
-        if tolerance_px is None:
-            times = 10.0 if stage.level == FULL else 80.0
-            tolerance_px = times * self.options.tolerance_px
-        last = np.inf
+        px, last = self.pair.grid.pixel_size, np.inf
         for number in range(1, self.options.steps + 1):
             at = self.linearised()
             step = at.step(stage.cutoff_px * px)
             length = np.linalg.norm(step.reshape(-1, 2), axis=1) / px
-            share = np.minimum(1.0, self.options.longest_step_px / np.maximum(length, 1e-12))
+            share = np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
             rms = float(np.sqrt(np.mean(length**2)))
             longest, residual = float(length.max()), at.sums.rms
             self.history.append(Step(stage.level, stage.cutoff_px, number, residual, rms, longest))
-            if not self.prior.is_linear or rms > min(_SHORT_PX, 0.5 * last):
+            if isinstance(self.prior, Imbalance) or rms > min(_SHORT_PX, 0.5 * last):
                 self.kept = None
             last = rms
             self._lap("factor")
-            if rms < tolerance_px:
+            if rms < stage.tolerance_px:
                 break
 
     def regularise(self) -> None:
@@ -350,14 +345,14 @@ class _Measurement:
         if cutoff is None:
             cutoff = first_px
             for _ in range(_ROUNDS):
-                self.through(Stage(FULL, cutoff))
+                self.through(_Stage(FULL, cutoff))
                 before, self.kept = cutoff, None  # the risk needs the matrix at u itself
                 self.tried = least_risk(self.linearised(), before, px, self._excess())
                 cutoff = best_of(self.tried)
                 self._lap("cut-off")
                 if abs(np.log(cutoff / before)) < _SETTLED:
                     break
-        self.through(Stage(FULL, cutoff), self.options.tolerance_px)
+        self.through(_Stage(FULL, cutoff, _LAST_TOLERANCE_PX))
         self.cutoff_px = cutoff
 
     def _excess(self) -> float:

@@ -67,11 +67,11 @@ class NodalPattern:
         joined.sort_indices()
         return cls(joined.indptr.astype(np.int64), joined.indices.astype(np.int64))
 
-    def assembled(self, nodes: IntArray, blocks: FloatArray) -> FloatArray:
-        """(parts, q) sums of symmetric blocks (m, parts, k, k) over their nodes (m, k)."""
-        data = np.zeros((blocks.shape[1], self.indices.size))
-        _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), data)
-        return data
+    def assembled(self, nodes: IntArray, blocks: FloatArray) -> csr_array:
+        """(2 n, 2 n) sums of symmetric blocks (m, 3, k, k), xx, xy, yy, over their nodes (m, k)."""
+        parts = np.zeros((3, self.indices.size))
+        _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), parts)
+        return self.matrix(parts)
 
     def both(self, matrix: csr_array) -> csr_array:
         """(2 n, 2 n) of a matrix (n, n) of either component, with this pattern."""
@@ -226,6 +226,7 @@ class Body:
         self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, roots.nodes)
         self.smoothness = self.pattern.both(roots.matrix())
         self.smoothness_samples = roots.samples(SAMPLES)
+        """(2 n, 2 n) R of both components, and (2 n, SAMPLES) random vectors of that covariance."""
         edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
         self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
         """Of the waves by which data and smoothness are compared [mm]."""
@@ -241,7 +242,7 @@ class Body:
 
     def matrix(self, blocks: FloatArray) -> csr_array:
         """(2 n, 2 n) of the blocks (m, 3, 6, 6) of the elements."""
-        return self.pattern.matrix(self.pattern.assembled(self.mesh.cells, blocks))
+        return self.pattern.assembled(self.mesh.cells, blocks)
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """(2 n,) of the parts (m, 6, 2) of the elements."""
@@ -294,8 +295,8 @@ def _waves(nodes: FloatArray, wavelength: float) -> FloatArray:
 class Smoothness:
     """How rough what is added to a start (n, 2) is, on a body's mesh."""
 
-    power, is_linear = 6, True
-    """Of a wave number, in what a wave costs; whether R is the same everywhere."""
+    power = 6
+    """Of a wave number, in what a wave costs."""
 
     def __init__(self, body: Body, start: FloatArray) -> None:
         self.body, self.start = body, start.ravel()
@@ -304,11 +305,6 @@ class Smoothness:
         """(2 n, 2 n) R and (2 n,) R(u - u_0)."""
         R = self.body.smoothness
         return R, R @ (u - self.start)
-
-    @property
-    def samples(self) -> FloatArray:
-        """(2 n, SAMPLES) random vectors of the covariance R."""
-        return self.body.smoothness_samples
 
 
 class Imbalance:
@@ -321,7 +317,7 @@ class Imbalance:
     loaded : (n,) True at nodes on which unknown forces act.
     """
 
-    power, is_linear = 4, False
+    power = 4
 
     def __init__(self, mesh: Mesh, material: Material, loaded: BoolArray) -> None:
         self.mesh, self.material = mesh, material
@@ -355,10 +351,6 @@ class Imbalance:
         f, K = self.forces(u)
         DK = self._free @ K
         return csr_array(K.T @ DK), np.asarray(DK.T @ f)
-
-    @property
-    def samples(self) -> None:
-        """None: what a law allows where there is no speckle is not known."""
 
 
 @dataclass(frozen=True, eq=False)

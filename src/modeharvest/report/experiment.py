@@ -159,7 +159,7 @@ def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
 
 
 _WHOLE_MAPS: WholeMaps[SnapshotState] = WholeMaps(
-    lambda state: state.data.wholes[state.k][0], lambda state: state.comparison,
+    lambda state: state.data.wholes[state.k][0], lambda state: state.comparison.displacement,
     lambda state: len(state.data.wholes) > 0,
 )  # fmt: skip
 

@@ -16,19 +16,8 @@ import numpy as np
 from numba import get_num_threads
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.idic.finite_element.files import (
-    NO_MORE,
-    Given,
-    read_result,
-    write_result,
-    write_vtu,
-)
-from modeharvest.idic.finite_element.measure import (
-    FiniteElementOptions,
-    Law,
-    measure_displacement,
-)
-from modeharvest.idic.finite_element.mesh import mesh_of_mask
+from modeharvest.idic.finite_element.files import Given, read_result, write_result, write_vtu
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
@@ -65,13 +54,12 @@ class WholeFieldOptions:
     """Cut-off wavelength of the regularisation [px]; None: found from the images."""
 
     def __post_init__(self) -> None:
-        self.on_mesh(None)
+        self.on_mesh()
 
-    def on_mesh(self, law: Law | None) -> FiniteElementOptions:
+    def on_mesh(self, law: Law | None = None) -> FiniteElementOptions:
         """The engine's options."""
-        return FiniteElementOptions(
-            self.element_px, self.edge_element_px, cutoff_px=self.cutoff_px, law=law
-        )
+        sizes = self.element_px, self.edge_element_px
+        return FiniteElementOptions(*sizes, cutoff_px=self.cutoff_px, law=law)
 
 
 def change_of(how: WholeFieldOptions, measure: bool | None) -> dict[str, WholeFieldOptions]:
@@ -96,7 +84,7 @@ class VirtualWholeFieldOptions(WholeFieldOptions):
     def of(self, experiment: Experiment, pixel_size: float) -> FiniteElementOptions:
         """The engine's options for an experiment, whose two ends along x are loaded."""
         if not self.material_law:
-            return self.on_mesh(None)
+            return self.on_mesh()
         on_ends = partial(_on_ends, experiment.specimen.half_size[0], pixel_size)
         return self.on_mesh(Law(experiment.material, on_ends))
 
@@ -139,7 +127,7 @@ class WholeFields:
         of: str,
         work: Callable[[Progress], NodalResult],
         progress: Progress,
-        given: Given = NO_MORE,
+        given: Given,
     ) -> tuple[Path, Path]:
         """Measure by ``work`` and write what was found; returns the files.
 
@@ -176,8 +164,7 @@ class WholeFields:
         count = max(1, min(most, int(available_bytes() / (BYTES_PER_PIXEL * mask.size))))
         with _children(count - 1) as children:
             with _with_remedy("mesh of the material"):
-                sizes = how.element_px, how.edge_element_px
-                body = Body(*mesh_of_mask(mask, images.grid, *sizes))
+                body = how.body(mask, images.grid)
             # The last state takes longest, and its progress is seen.
             first, *others = (
                 partial(
@@ -187,7 +174,9 @@ class WholeFields:
                 for k in range(count)
             )  # fmt: skip
             for child, share in zip(children, others, strict=True):
-                _hand_to(child, share)
+                assert child.stdin
+                with suppress(BrokenPipeError), child.stdin as to:  # why is seen in the end
+                    pickle.dump(share, to)
             first(progress)
         stems = [self.path(name_of(strain)) for strain in images.strains]
         return [path.with_suffix(kind) for path in stems for kind in (".h5", ".vtu")]
@@ -235,16 +224,9 @@ def _measure(
         files.measure(name_of(strain), of, partial(one, strain), progress, given)
 
 
-def _hand_to(child: subprocess.Popen[bytes], share: Callable[[Progress], None]) -> None:
-    """Let one of ``_children`` do a share of the work."""
-    assert child.stdin
-    with suppress(BrokenPipeError), child.stdin as to:  # why it ended is seen in the end
-        pickle.dump(share, to)
-
-
 @contextmanager
 def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes that do the share they are given; none is left in the end.
+    """Processes that do the share, pickled, that they are given; none is left in the end.
 
     InputError as it comes from one, or if one was killed; RuntimeError if one fails otherwise.
     """

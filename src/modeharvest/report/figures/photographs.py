@@ -270,7 +270,14 @@ def truth_of(state: PhotographState) -> FrameTruth | None:
     return None if truth is None else truth.frames.get(state.frame.name)
 
 
-WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(lambda state: state.frame.whole, truth_of)
+def _true_displacement(state: PhotographState) -> FloatArray | None:
+    truth = truth_of(state)
+    return None if truth is None else truth.displacement
+
+
+WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(
+    lambda state: state.frame.whole, _true_displacement
+)
 
 WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
 _LEGEND = 0.26  # [in]

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol
+from typing import Any, Generic
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.imaging.grid import PixelGrid
@@ -16,6 +15,7 @@ from modeharvest.report.figures import fits
 from modeharvest.report.figures.fits import UM, Panel, S
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
 from modeharvest.report.model import Card, Cell, ReportTable, text_of
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import headings
 from modeharvest.validation.truth import lengths
 from modeharvest.validation.whole_field import WholeField, WholeFieldNumbers, WholeFieldSummary
@@ -26,21 +26,14 @@ Numbers = Mapping[str, Any]
 """A whole displacement's in ``summary.json``."""
 
 
-class HasTruth(Protocol):
-    """Knows the true displacement."""
-
-    @property
-    def displacement(self) -> NDArray[Any]:
-        """(rows, cols, 2) at the images' pixels [mm]."""
-
-
 @dataclass(frozen=True)
 class WholeMaps(Generic[S]):
     """Maps of the whole displacement of states."""
 
     whole: Callable[[S], WholeField | None]
-    truth: Callable[[S], HasTruth | None]
-    """Of a state, where they are known; may wait for them."""
+    truth: Callable[[S], FloatArray | None]
+    """Of a state, where they are known; may wait for them. The truth is (rows, cols, 2) at the
+    images' pixels [mm]."""
     is_known: Callable[[S], bool] | None = None
     """Whether both are, where finding out may wait otherwise."""
 
@@ -73,13 +66,13 @@ class WholeMaps(Generic[S]):
         w = UM * lengths(self._measured(state).displacement_on(grid) - by_idic)
         true, shown = self.truth(state), w
         if true is not None:
-            shown = UM * lengths(true.displacement[np.ix_(*frame.pixels)] - by_idic)
+            shown = UM * lengths(frame.sample(true) - by_idic)
         return draw_field(frame, w, ColourScale.size(shown, "µm", 0.998), state.motion)
 
     def _error(self, state: S) -> Figure:
         true, measured = self.truth(state), self._measured(state).displacement_on(state.view.grid)
         assert true is not None
-        error = lengths(true.displacement - measured)
+        error = lengths(true - measured)
         return fits.draw_length(state, state.view.map_frame().average(error), share=_SHARE)
 
     def _principal_strain(self, state: S) -> Figure:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.finite_element.files import Given
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
@@ -88,10 +87,12 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
         return WholeFields(self.folder / "whole_field")
 
     @cached_property
+    def _how(self) -> FiniteElementOptions:
+        return replace(self.case.whole_field.on_mesh(), edge_px=_EDGE_PX)
+
+    @cached_property
     def _body(self) -> Body:
-        how, prepared = self.case.whole_field, self.prepared
-        sizes = how.element_px, how.edge_element_px
-        return Body(*mesh_of_mask(prepared.mask(), prepared.grid, *sizes))
+        return self._how.body(self.prepared.mask(), self.prepared.grid)
 
     @cached_property
     def _measured(self) -> tuple[dict[str, WholeField], dict[str, str]]:
@@ -113,9 +114,8 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
                 else:
                     known = last and last[1].measured
                     begin = block_motion(pair, body.mesh, known, ("the reference", name))
-                cutoff = self.case.whole_field.cutoff_px
-                options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
-                return self._warned(displacement_from(begin, pair, body, options, progress), name)
+                found = displacement_from(begin, pair, body, self._how, progress)
+                return self._warned(found, name)
 
             given, refit = Given(correlation=correlated), self._refit(name)
             files = self._files.measure(name, name, measured, self.progress, given)
