@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,15 +35,9 @@ class Field:
 
     def components(self, values: FloatArray) -> dict[str, FloatArray]:
         """Components (...) of values (..., 2, 2), (..., 2) or (...), by what they are called."""
-        names = self.parts.split()
-        if not names:
-            return {"": values}
-        return {
-            name: values[..., "xy".index(name[0]), "xy".index(name[1])]
-            if len(name) == 2
-            else values[..., "xy".index(name)]
-            for name in names
-        }
+        names = self.parts.split() or [""]
+        places: dict[str, Any] = {name: (..., *map("xy".index, name)) for name in names}
+        return {name: values[place] for name, place in places.items()}
 
 
 def determinant(F: FloatArray) -> FloatArray:
