@@ -37,75 +37,53 @@ what is not would be nothing."""
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The unknowns with their covariance, and an account of the iteration.
-
-    Parameters
-    ----------
-    ansatz
-        The kinematics.
-    grid
-        The pixels of the full images.
-    unknowns
-        (n,): a, in the order of ``ansatz.names``.
-    inverse
-        (n, n) covariance of the unknowns for a residual of white noise of variance 1: with least
-        squares M^-1, M = J'J being the Gauss-Newton matrix; with other weights h in place of J
-        (h'J)^-1 h'h (J'h)^-1. Infinite on the diagonal where nothing could be determined.
-    residual_rms
-        Root mean square of the residual over the pixels used: grey levels, or mm per component
-        for a fit to a displacement.
-    pixels, outside_image
-        Pixels used, and pixels mapped outside the deformed image. A fit to a displacement
-        counts each pixel twice, once for each component.
-    outcome
-        Why the iteration ended, on the finest level.
-    condition_number
-        Of the column-scaled Gauss-Newton matrix.
-    history
-        Every iteration of every level.
-    timings_s
-        Seconds for each step; not in a result's file, which two runs leave the same.
-    residual_correlation
-        Rms autocorrelation of the residual [-]: near 0 for noise; NaN for a fit to a
-        displacement. See :meth:`residual_test`.
-    residual_lags_px
-        How far apart it was taken [px].
-    decorrelated_fraction
-        Of the image, where f and g(x + u) have little to do with each other [-]; above 0.1 the
-        outcome is LOCAL_MINIMUM. NaN for a fit to a displacement.
-    weighting
-        Which gradient weighed the residual.
-    slope_square, weight_square
-        Mean squares along an axis of the deformed image's gradient and of the one that weighed
-        the residual, noise included [grey levels^2/px^2].
-    noise_transfer
-        What of the deformed image's noise reaches the residual.
-    order
-        Of the spline.
-    final_smoothing
-        Of the images on the finest level; None where there was none to choose.
-    """
+    """The unknowns with their covariance, and an account of the iteration."""
 
     ansatz: Ansatz
+    """The kinematics."""
     grid: PixelGrid
+    """The pixels of the full images."""
     unknowns: FloatArray
+    """(n,): a, in the order of ``ansatz.names``."""
     inverse: FloatArray
+    """(n, n) covariance of the unknowns for a residual of white noise of variance 1: with least
+    squares M^-1, M = J'J being the Gauss-Newton matrix; with other weights h in place of J (h'J)^-1
+    h'h (J'h)^-1. Infinite on the diagonal where nothing could be determined."""
     residual_rms: float
+    """Root mean square of the residual over the pixels used: grey levels, or mm per component for a
+    fit to a displacement."""
     pixels: int
     outside_image: int
+    """Pixels used, and pixels mapped outside the deformed image. A fit to a displacement counts
+    each pixel twice, once for each component."""
     outcome: Outcome
+    """Why the iteration ended, on the finest level."""
     condition_number: float
+    """Of the column-scaled Gauss-Newton matrix."""
     history: tuple[Iteration, ...] = ()
+    """Every iteration of every level."""
     timings_s: Mapping[str, float] = field(default_factory=dict)
+    """Seconds for each step; not in a result's file, which two runs leave the same."""
     residual_correlation: float = float("nan")
+    """Rms autocorrelation of the residual [-]: near 0 for noise; NaN for a fit to a displacement.
+    See :meth:`residual_test`."""
     decorrelated_fraction: float = float("nan")
+    """Of the image, where f and g(x + u) have little to do with each other [-]; above 0.1 the
+    outcome is LOCAL_MINIMUM. NaN for a fit to a displacement."""
     residual_lags_px: tuple[int, ...] = LAGS_PX
+    """How far apart the residual's autocorrelation was taken [px]."""
     weighting: Weighting = field(default_factory=Weighting)
+    """Which gradient weighed the residual."""
     slope_square: float = 0.0
     weight_square: float = 0.0
+    """Mean squares along an axis of the deformed image's gradient and of the one that weighed the
+    residual, noise included [grey levels^2/px^2]."""
     noise_transfer: NoiseTransfer = field(default_factory=NoiseTransfer)
+    """What of the deformed image's noise reaches the residual."""
     order: int = 5
+    """Of the spline."""
     final_smoothing: FinalSmoothing | None = None
+    """Of the images on the finest level; None where there was none to choose."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
