@@ -71,11 +71,7 @@ def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int, meth
 
 
 def alone(
-    function: str,
-    cases: tuple[Case, ...],
-    folder: Path,
-    workers: int,
-    method: str = "forkserver",
+    function: str, cases: tuple[Case, ...], folder: Path, workers: int, method: str = "forkserver"
 ) -> Timing:
     """The same in a process of its own: workers of an earlier campaign would make it faster."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:

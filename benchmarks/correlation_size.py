@@ -144,7 +144,7 @@ def shown(rows: list[Row]) -> None:
             f"| {r['mpx']:.3g} | {r['degree']} | {r['unknowns']} | {r['outcome']} "
             f"| {r['residual_rms']:.3f} | {' '.join(map(str, r['steps']))} | {r['seconds']:.2f} "
             f"| {r['seconds'] / r['mpx']:.3f} | {r['gradient_ns']:.1f} | {r['matrix_ns']:.1f} "
-            f"| {r['images']:.1f} | {r['mib']:.0f} |",
+            f"| {r['images']:.1f} | {r['mib']:.0f} |"
         )
 
 

@@ -31,10 +31,7 @@ from modeharvest.fem.specimen import Specimen
 
 SIZES = (0.3, 0.2, 0.15, 0.12, 0.1)
 MATERIALS: dict[str, Material] = {"Ogden": Ogden(), "TwoTermI1": TwoTermI1()}
-CASES = {
-    "6 x 10": Experiment(),
-    "12 x 10": Experiment(Specimen(12, 10), strains=(0.082, 0.127)),
-}
+CASES = {"6 x 10": Experiment(), "12 x 10": Experiment(Specimen(12, 10), strains=(0.082, 0.127))}
 
 
 class NaiveLoop:

@@ -136,7 +136,7 @@ def stages(mesh: Mesh, u: FloatArray) -> None:
         "cubic spline of the reference image": lambda: SplineImage.of(image, 3).sample(row, col)[0],
     }
     whole: dict[str, Work] = {
-        "whole image, mapping and speckle": lambda: render(mesh, u, grid, speckle),
+        "whole image, mapping and speckle": lambda: render(mesh, u, grid, speckle)
     }
     found = in_turn(mapping | speckles | whole)
     some = np.random.default_rng(0).choice(row.size, POINTS, replace=False)

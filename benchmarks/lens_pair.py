@@ -138,11 +138,7 @@ def recover_camera(
 
 
 def _views(
-    images: Sequence[NDArray[np.float32]],
-    poses: FloatArray,
-    blur: float,
-    order: int,
-    light: bool,
+    images: Sequence[NDArray[np.float32]], poses: FloatArray, blur: float, order: int, light: bool
 ) -> list[View]:
     """The image without and that with distortion; of the latter the light may change."""
     ideal, observed = (blurred_spline(image, blur, order) for image in images)

@@ -64,6 +64,14 @@ class Mesh:
             raise InputError(f"a cell names a node outside 0 ... {len(self.nodes) - 1}")
 
 
+def with_mid_sides(nodes: FloatArray, cells: IntArray) -> tuple[FloatArray, IntArray]:
+    """Nodes (n + s, 2) and cells (m, 6) of T6 elements with straight sides, from T3's (m, 3)."""
+    ends = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+    sides, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    middle = len(nodes) + number.reshape(-1, 3)
+    return np.vstack([nodes, nodes[sides].mean(axis=1)]), np.hstack([cells, middle])
+
+
 def boundary_sides(mesh: Mesh) -> IntArray:
     """(s, 3) first corner, mid-side and second corner of the sides that only one cell has.
 

@@ -115,11 +115,7 @@ class Ansatz:
 
     @classmethod
     def square(
-        cls,
-        specimen: Specimen,
-        *,
-        fixed_mode: bool = False,
-        options: AnsatzOptions | None = None,
+        cls, specimen: Specimen, *, fixed_mode: bool = False, options: AnsatzOptions | None = None
     ) -> Ansatz:
         """:meth:`of_specimen` in square stacking; InputError for any other."""
         if specimen.stacking != "square":
@@ -131,11 +127,7 @@ class Ansatz:
 
     @classmethod
     def of_specimen(
-        cls,
-        specimen: Specimen,
-        *,
-        fixed_mode: bool = False,
-        options: AnsatzOptions | None = None,
+        cls, specimen: Specimen, *, fixed_mode: bool = False, options: AnsatzOptions | None = None
     ) -> Ansatz:
         """Make the ansatz with a specimen's modes; the paper's 77 unknowns in square stacking.
 

@@ -110,11 +110,7 @@ def correlate(
 
 
 def best_fit(
-    truth: Truth,
-    result: Result,
-    *,
-    guesses: Sequence[FloatArray] = (),
-    progress: Progress = silent,
+    truth: Truth, result: Result, *, guesses: Sequence[FloatArray] = (), progress: Progress = silent
 ) -> Result:
     """Fit a result's ansatz to the true displacement: what the measurement could find at best.
 
@@ -237,12 +233,7 @@ class _Course:
         self.progress(self.done + number / most, self.count, "correlate")
 
     def through(
-        self,
-        levels: tuple[Level, ...],
-        pair: ImagePair,
-        ansatz: Ansatz,
-        a: FloatArray,
-        order: int,
+        self, levels: tuple[Level, ...], pair: ImagePair, ansatz: Ansatz, a: FloatArray, order: int
     ) -> _Reached:
         """Go through levels; on the last one all unknowns are sought, to the full tolerance.
 

@@ -272,10 +272,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
     """Everything a result holds but its timings, and what it means in words."""
     content: dict[str, Any] = {name: to_plain(getattr(result, name)) for name in _STORED}
     weighting = result.weighting
-    content["weighting"] |= {
-        "gradient": weighting.gradient.value,
-        "explanation": weighting.text,
-    }
+    content["weighting"] |= {"gradient": weighting.gradient.value, "explanation": weighting.text}
     return content | {
         "outcome": result.outcome.value,
         "explanation": result.outcome.explanation,

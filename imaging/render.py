@@ -26,21 +26,11 @@ from modeharvest.imaging.mapping.elements import (
     reference_element,
     require_positive_jacobian,
 )
-from modeharvest.imaging.mapping.isoparametric import (
-    Located,
-    interpolate,
-    locate,
-    locate_points,
-)
+from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
 from modeharvest.imaging.mapping.rasterise import fill
 from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.speckle.pattern import Speckle
-from modeharvest.imaging.speckle.periodic_spline import (
-    BLOCK,
-    SplineTable,
-    sample,
-    workspace,
-)
+from modeharvest.imaging.speckle.periodic_spline import BLOCK, SplineTable, sample, workspace
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
 from modeharvest.util.compiled import compiled, in_parallel
 

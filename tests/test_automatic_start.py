@@ -16,11 +16,7 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion, outline_motion, robust_fit
-from modeharvest.idic.photograph.initial_guess import (
-    InitialGuess,
-    hole_centres,
-    initial_guess,
-)
+from modeharvest.idic.photograph.initial_guess import InitialGuess, hole_centres, initial_guess
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE

@@ -63,9 +63,7 @@ def error_px(found: FloatArray, where: BoolArray) -> float:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_without_those_that_land_at_the_border_the_error_is_that_of_float_images(
-    seed: int,
-) -> None:
+def test_without_those_that_land_at_the_border_the_error_is_that_of_float_images(seed: int) -> None:
     """A spline feels the border by 0.43 a pixel: 1e-4 of it are left after 10 px."""
     mask = landing() > 10
     found = correlate(

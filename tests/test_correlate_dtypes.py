@@ -127,9 +127,7 @@ def test_the_layout_in_memory_does_not_matter(view: Callable[[Array], Array], dt
 
 
 @pytest.mark.parametrize("view", [every_other, read_only, unaligned, np.asfortranarray])
-def test_however_arrays_are_kept_no_kernel_is_compiled_anew(
-    view: Callable[[Array], Array],
-) -> None:
+def test_however_arrays_are_kept_no_kernel_is_compiled_anew(view: Callable[[Array], Array]) -> None:
     """Kernels are compiled for layout and writability, too; that takes a minute."""
     expected()
     before = signatures()

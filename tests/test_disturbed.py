@@ -165,8 +165,7 @@ def lasting(files: Mapping[str, str]) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[pytest.mark.dolfinx] * (n in NEEDS_DOLFINX)) for n in PIPELINES],
+    "name", [pytest.param(n, marks=[pytest.mark.dolfinx] * (n in NEEDS_DOLFINX)) for n in PIPELINES]
 )
 def test_disturbed_runs_end_like_an_undisturbed_one(
     name: str, forks: subprocess.Popen[str], tmp_path: Path

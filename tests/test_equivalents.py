@@ -12,11 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_fields import square_mode
 
-from modeharvest.idic.spectra.pattern import (
-    REFERENCE_MODE,
-    mode_deviation,
-    mode_equivalent,
-)
+from modeharvest.idic.spectra.pattern import REFERENCE_MODE, mode_deviation, mode_equivalent
 
 PITCH = manufactured.UNIT_CELL
 modes = st.tuples(*[st.floats(-1.5, 1.5)] * 7)

@@ -135,10 +135,7 @@ def test_seeds_of_noise_scatter_as_the_curvature_predicts(model_error: float, sd
         images = quiet[0] + noise[0], quiet[1] + noise[1]
         ends.append(
             correlate(
-                ImagePair(*images, GRID, MASK),
-                result.ansatz,
-                guess=result.unknowns,
-                options=FINEST,
+                ImagePair(*images, GRID, MASK), result.ansatz, guess=result.unknowns, options=FINEST
             ).unknowns
         )
     told, seen = (

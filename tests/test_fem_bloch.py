@@ -26,11 +26,7 @@ from modeharvest.fem.bloch.dispersion import ZONES, zone_path
 from modeharvest.fem.bloch.eigen import BlochWaves, scan
 from modeharvest.fem.lattice.bloch_map import Condensation, factorise, negative_pivots
 from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
-from modeharvest.fem.lattice.cells import (
-    UnitCell,
-    hexagonal,
-    square,
-)
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.options import (
     CriticalSearch,
     MacroLoading,

@@ -105,9 +105,7 @@ def test_six_ligaments_make_an_isotropic_plane() -> None:
 
 
 @pytest.mark.parametrize("thickness", [0.05, 0.02])
-def test_hexachiral_poisson_ratio_is_that_of_beams_between_rigid_rings(
-    thickness: float,
-) -> None:
+def test_hexachiral_poisson_ratio_is_that_of_beams_between_rigid_rings(thickness: float) -> None:
     """Prall & Lakes (1997), doi 10.1016/S0020-7403(96)00025-2: towards -1 if slender.
 
     With δ the lengthening of a ligament and θ its rotation against its rings, both are linear

@@ -314,10 +314,7 @@ def test_scatter_has_the_stated_deviation_and_seed() -> None:
         (lambda: Specimen(diameter=float("nan")), "0 < diameter < pitch"),
         (lambda: Specimen(bulk_y=float("nan")), "bulk edges of 0 mm or more"),
         (lambda: Specimen(pitch=float("inf")), "finite"),
-        (
-            lambda: Specimen(grading_x=0.1),
-            r"0 < d < 1.9 mm.*got d from 1.025 to 1.975 mm",
-        ),
+        (lambda: Specimen(grading_x=0.1), r"0 < d < 1.9 mm.*got d from 1.025 to 1.975 mm"),
         (lambda: Specimen(grading_y=-0.2), "0 < d < 1.9 mm"),
         (lambda: Specimen(stacking="rectangular"), "a pitch_y for rectangular stacking, got None"),
         (lambda: Specimen(pitch_y=2.0), "no pitch_y for square stacking, got 2.0"),

@@ -22,12 +22,7 @@ from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.field import Solution
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
-from modeharvest.fem.lattice.options import (
-    CriticalSearch,
-    MacroLoading,
-    equibiaxial,
-    uniaxial,
-)
+from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, equibiaxial, uniaxial
 from modeharvest.fem.lattice.periodicity import overlaps
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.util.errors import InputError

@@ -232,12 +232,7 @@ def test_strain_out_of_reach_keeps_what_converged_and_says_so() -> None:
 def test_info_tells_how_it_came_about() -> None:
     info = reference().info
     assert info["specimen"]["holes_y"] == 6
-    assert info["material"] == {
-        "kind": "Ogden",
-        "moduli": [1.2],
-        "exponents": [3.0],
-        "kappa": 5.4,
-    }
+    assert info["material"] == {"kind": "Ogden", "moduli": [1.2], "exponents": [3.0], "kappa": 5.4}
     curve = info["path"]["primary"]
     assert np.all(np.diff(curve["nominal_strain"]) > 0)
     assert len({len(column) for column in curve.values()}) == 1

@@ -133,10 +133,7 @@ CASES: dict[str, tuple[Spoil, str]] = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_it_is_one_line_and_nothing_is_lost(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    case: str,
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], case: str
 ) -> None:
     spoil, message = CASES[case]
     spoil(folder)

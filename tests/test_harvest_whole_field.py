@@ -27,12 +27,7 @@ from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
 from modeharvest.runs.photographs.whole_field import PhotographWholeFields, whole_checks
 from modeharvest.util.errors import InputError
-from modeharvest.validation.whole_field import (
-    WholeField,
-    compare_whole,
-    v_percent,
-    waves_percent,
-)
+from modeharvest.validation.whole_field import WholeField, compare_whole, v_percent, waves_percent
 
 pytest.importorskip("gmsh")
 pytestmark = pytest.mark.usefixtures("coarse_pictures")

@@ -157,12 +157,7 @@ def test_sizes_must_match() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "image"),
-    [
-        ("a.png", RAMP),
-        ("a.tif", RAMP[0]),
-        ("a.tif", RAMP.astype(np.complex128)),
-    ],
+    ("name", "image"), [("a.png", RAMP), ("a.tif", RAMP[0]), ("a.tif", RAMP.astype(np.complex128))]
 )
 def test_refuses_to_write_what_it_could_not_read(
     tmp_path: Path, name: str, image: NDArray[Any]

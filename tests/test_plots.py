@@ -19,12 +19,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.waves import PlaneWave
-from modeharvest.report.experiment import (
-    ExperimentData,
-    SnapshotState,
-    draw_hero,
-    snapshot_panels,
-)
+from modeharvest.report.experiment import ExperimentData, SnapshotState, draw_hero, snapshot_panels
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import (
     draw_convergence,

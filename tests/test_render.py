@@ -8,12 +8,7 @@ from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import Truth
-from modeharvest.imaging.render import (
-    ImagedState,
-    Rendering,
-    render_deformed,
-    render_reference,
-)
+from modeharvest.imaging.render import ImagedState, Rendering, render_deformed, render_reference
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.errors import InputError
 

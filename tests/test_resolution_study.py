@@ -21,17 +21,8 @@ from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.report.study_resolution import measured_waves, noise_floors, report_resolution
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
-from modeharvest.validation.studies.buckled import (
-    LARGEST,
-    AddedWave,
-    BuckledMotion,
-    ResolutionSpec,
-)
-from modeharvest.validation.studies.resolution import (
-    ResolutionAnalysis,
-    ResolutionStudy,
-    one_case,
-)
+from modeharvest.validation.studies.buckled import LARGEST, AddedWave, BuckledMotion, ResolutionSpec
+from modeharvest.validation.studies.resolution import ResolutionAnalysis, ResolutionStudy, one_case
 from modeharvest.validation.studies.study import ImagePairSpec as Experiment
 from modeharvest.validation.studies.transfer import (
     AXES,

@@ -18,11 +18,7 @@ from modeharvest.idic.finite_element.pixels import (
     images_on,
     normal_equations,
 )
-from modeharvest.idic.finite_element.system import (
-    Body,
-    SmoothnessRoots,
-    interior_sides,
-)
+from modeharvest.idic.finite_element.system import Body, SmoothnessRoots, interior_sides
 from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair

@@ -15,7 +15,7 @@ import gmsh
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.fem.field import Mesh, read_any_mesh
+from modeharvest.fem.field import Mesh, read_any_mesh, with_mid_sides
 from modeharvest.fem.lattice.cells import UnitCell
 from modeharvest.fem.lattice.options import lattice_vectors
 from modeharvest.fem.meshing import REVERSED_T6, gmsh_options, quiet_gmsh, require_size
@@ -275,7 +275,7 @@ def sound_t6(points: FloatArray, cells: IntArray) -> Mesh:
     used, numbers = np.unique(cells, return_inverse=True)
     nodes, cells = _in_plane(points[used]), numbers.reshape(cells.shape).astype(np.int64)
     if cells.shape[1] == 3:
-        nodes, cells = _with_mid_sides(nodes, cells)
+        nodes, cells = with_mid_sides(nodes, cells)
     a, b, c = (nodes[cells[:, k]] for k in range(3))
     clockwise = np.linalg.det(np.stack([b - a, c - a], axis=1)) < 0
     cells = np.where(clockwise[:, None], cells[:, REVERSED_T6], cells)
@@ -304,13 +304,6 @@ def _in_plane(points: FloatArray) -> FloatArray:
         low, high = points[:, 2].min(), points[:, 2].max()
         raise InputError(f"expected a plane mesh, z = const, got z from {low:.5g} to {high:.5g} mm")
     return points[:, :2]
-
-
-def _with_mid_sides(nodes: FloatArray, cells: IntArray) -> tuple[FloatArray, IntArray]:
-    ends = np.sort(np.stack([cells[:, side] for side in _SIDES], axis=1), axis=2)
-    sides, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
-    middles = nodes[sides].mean(axis=1)
-    return np.vstack([nodes, middles]), np.hstack([cells, len(nodes) + number.reshape(-1, 3)])
 
 
 def _smallest_jacobians(mesh: Mesh) -> FloatArray:

@@ -34,11 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.fields import (
-    interpolation_error,
-    mean_around,
-    nodal_gradient,
-)
+from modeharvest.idic.finite_element.fields import interpolation_error, mean_around, nodal_gradient
 from modeharvest.idic.finite_element.system import SAMPLES, Linearised, Smoothness
 from modeharvest.util.arrays import FloatArray, IntArray
 

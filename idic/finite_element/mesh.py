@@ -17,7 +17,7 @@ from scipy import ndimage
 from scipy.signal import savgol_filter
 from skimage import measure
 
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import Mesh, with_mid_sides
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import require_positive_jacobian
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
@@ -200,11 +200,7 @@ def quadratic(mesh: Mesh) -> Mesh:
     if mesh.element in _REVERSED and (_twice_area(mesh.nodes, mesh.cells) < 0.0).all():
         mesh = Mesh(mesh.nodes, mesh.cells[:, _REVERSED[mesh.element]], mesh.element)
     if mesh.element == "T3":
-        ends = np.sort(mesh.cells[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
-        sides, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
-        nodes = np.vstack([mesh.nodes, mesh.nodes[sides].mean(axis=1)])
-        middle = len(mesh.nodes) + number.reshape(-1, 3)
-        mesh = Mesh(nodes, np.hstack([mesh.cells, middle]), "T6")
+        mesh = Mesh(*with_mid_sides(mesh.nodes, mesh.cells), "T6")
     if mesh.element != "T6":
         raise InputError(
             f"expected a mesh of T3 or T6 elements to measure on, got {mesh.element}; split them "

@@ -294,11 +294,7 @@ def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: 
 
 
 def _cellular(
-    table: SpecimenTable,
-    lattice: HoleLattice | None,
-    mask: BoolArray,
-    grid: PixelGrid,
-    base: Path,
+    table: SpecimenTable, lattice: HoleLattice | None, mask: BoolArray, grid: PixelGrid, base: Path
 ) -> Region:
     """The cellular part: drawn, given as an image, or where the holes or the parts are."""
     if table.polygon:

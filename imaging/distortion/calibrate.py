@@ -269,10 +269,7 @@ def _rough_shifts(photographs: Sequence[FloatImage]) -> FloatArray:
 
 
 def _views(
-    photographs: Sequence[FloatImage],
-    poses: FloatArray,
-    free: tuple[bool, ...],
-    blur: float,
+    photographs: Sequence[FloatImage], poses: FloatArray, free: tuple[bool, ...], blur: float
 ) -> list[View]:
     """Photographs as splines; the first one stays where it is."""
     return [

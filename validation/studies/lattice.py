@@ -407,10 +407,7 @@ class StudyPlan:
 
 
 def run_lattice_study(
-    base: StudiedLattice,
-    plan: StudyPlan,
-    table: Path | None = None,
-    progress: Progress = silent,
+    base: StudiedLattice, plan: StudyPlan, table: Path | None = None, progress: Progress = silent
 ) -> LatticeModeStudy:
     """The whole study about one lattice: hole sizes, scales, materials, limits, overlays.
 

@@ -18,12 +18,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.campaign import grid
-from modeharvest.validation.studies.buckled import (
-    LARGEST,
-    AddedWave,
-    BuckledMotion,
-    ResolutionSpec,
-)
+from modeharvest.validation.studies.buckled import LARGEST, AddedWave, BuckledMotion, ResolutionSpec
 from modeharvest.validation.studies.study import ImagePairSpec, Study, noisy
 from modeharvest.validation.studies.transfer import (
     AXES,

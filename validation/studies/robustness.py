@@ -15,12 +15,7 @@ from scipy.stats import binomtest
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.studies.study import (
-    ImagePairSpec,
-    Study,
-    VirtualImagePair,
-    outcome_of,
-)
+from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair, outcome_of
 from modeharvest.validation.workers import Case, Cases, Row
 
 SAME_PX = 0.01

@@ -39,8 +39,7 @@ def make(
     case: CaseName,
     out: Annotated[Path, folder_option("--out", "The public folder.")],
     truth: Annotated[
-        Path | None,
-        folder_option("--truth", "Folder for the truth [DIR-truth]."),
+        Path | None, folder_option("--truth", "Folder for the truth [DIR-truth].")
     ] = None,
     solution: SolutionFile = None,
 ) -> None:

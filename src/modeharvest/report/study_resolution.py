@@ -18,10 +18,7 @@ from modeharvest.report.figures.curves import curve, plain_ticks
 from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.validation.scoring.star import KEPT
 from modeharvest.validation.studies.buckled import ResolutionSpec
-from modeharvest.validation.studies.resolution import (
-    MOTIONS,
-    ResolutionAnalysis,
-)
+from modeharvest.validation.studies.resolution import MOTIONS, ResolutionAnalysis
 from modeharvest.validation.studies.transfer import (
     AXES,
     QUANTITIES,

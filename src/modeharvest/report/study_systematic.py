@@ -14,11 +14,7 @@ from matplotlib.ticker import NullLocator
 
 from modeharvest.report.figures import style
 from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
-from modeharvest.validation.studies.systematic import (
-    BASE,
-    FACTORS,
-    SystematicAnalysis,
-)
+from modeharvest.validation.studies.systematic import BASE, FACTORS, SystematicAnalysis
 
 ERROR_LABELS = {
     "measurement_error_px": "measurement error, IDIC − best fit [px]",

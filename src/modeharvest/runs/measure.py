@@ -50,11 +50,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
-from modeharvest.imaging.photographs.photograph import (
-    Photograph,
-    read_frame,
-    read_reference,
-)
+from modeharvest.imaging.photographs.photograph import Photograph, read_frame, read_reference
 from modeharvest.runs.photographs.prepare import CODE, LIBRARIES, named_files
 from modeharvest.runs.whole_field import BYTES_PER_PIXEL
 from modeharvest.util.arrays import BoolArray, FloatArray

@@ -103,12 +103,7 @@ class Stages:
         )  # fmt: skip
 
     def do(
-        self,
-        name: str,
-        key: str,
-        work: Callable[[], Iterable[Path]],
-        *,
-        collective: bool = False,
+        self, name: str, key: str, work: Callable[[], Iterable[Path]], *, collective: bool = False
     ) -> None:
         """Do the work unless it was finished with the same key and its files are whole.
 

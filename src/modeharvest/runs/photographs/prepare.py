@@ -317,10 +317,7 @@ def _noise(case: PhotographCase, reference: Photograph, mask: BoolArray) -> Came
 
 
 def local_field(
-    case: PhotographCase,
-    prepared: PreparedPhotographs,
-    name: str,
-    distortion: Distortion | None,
+    case: PhotographCase, prepared: PreparedPhotographs, name: str, distortion: Distortion | None
 ) -> LocalField | None:
     """The displacement field of one deformed photograph by a local DIC; None if there is none.
 
