@@ -112,7 +112,6 @@ class Row:
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     gigabytes: float = 0.0
-    timings_s: dict[str, float] = field(default_factory=dict)
 
 
 def main() -> None:
@@ -209,7 +208,7 @@ def measured(
         noise, seed, result.cutoff_px, **rms, longest=longest,
         refit=float(np.sqrt(np.mean(refit**2))), covered=covered(result, error, regions),
         unknowns=result.unknowns, seconds=wall, cpu_seconds=cpu, gigabytes=used,
-        timings_s=dict(result.timings_s), contradicted=result.contradicted,
+        contradicted=result.contradicted,
         noticed=any("law" in text for text in result.warnings),
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ from modeharvest.util.typed import made, to_plain
 FORMAT = "modeharvest-nodal-displacement-2"
 _TYPES = get_type_hints(NodalResult)
 _ARRAYS = [name for name, kind in _TYPES.items() if kind == FloatArray]
-_PLAIN = [name for name in _TYPES if name not in (*_ARRAYS, "mesh", "timings_s")]
+_PLAIN = [name for name in _TYPES if name not in (*_ARRAYS, "mesh")]
 """Two measurements leave the same bytes, so their seconds are kept elsewhere."""
 _VECTORS = {
     "displacement": ("u", "v up"),

@@ -8,7 +8,6 @@ last cut-off wavelength is found from the images alone, see ``cutoff``.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -145,8 +144,6 @@ def measure_displacement(
     InputError if the mesh is folded or of other elements, covers no more than a part of the mask,
     or has parts that show no pixels.
 
-    Parameters
-    ----------
     pair : of images. Without a mask every pixel counts.
     start : where the measurement begins: a correlation's result, or any displacement closer to the
         truth than about 10 px; what is found is smooth relative to it.
@@ -213,8 +210,6 @@ class _Measurement:
         self.prior: Smoothness | Imbalance = Smoothness(body, begin)
         self.u = begin.ravel().copy()
         self.history: list[Step] = []
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
         self.level: _LevelOnMesh | None = None
         self.kept: Linearised | None = None
         self.free: tuple[FloatArray, Deviations] | None = None
@@ -224,11 +219,6 @@ class _Measurement:
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = spline_order(self.speckle_px)
 
-    def _lap(self, step: str) -> None:
-        now = time.perf_counter()
-        self.laps[step] = self.laps.get(step, 0.0) + now - self._last
-        self._last = now
-
     def _prepare(self, level: Level) -> _LevelOnMesh:
         if self.level is None or self.level.level != level:
             order = self.order if level == FULL else 5
@@ -237,7 +227,6 @@ class _Measurement:
             self.level, self.kept = _LevelOnMesh(level, images, pixels), None
             if level == FULL:
                 self.level = self._weighed_by_reference(self.level)
-            self._lap("images")
         return self.level
 
     def _weighed_by_reference(self, on: _LevelOnMesh) -> _LevelOnMesh:
@@ -275,7 +264,6 @@ class _Measurement:
         else:
             blocks, M, signal, ratio = kept.sums.blocks, kept.M, kept.signal, kept.ratio
         gradient = body.vector(signal[:, None, None] * sums.gradient)
-        self._lap("pixels")
         sums = replace(sums, blocks=blocks)
         self.kept = Linearised(
             body, self.prior, self.u, sums, signal, M, gradient, R, penalty, ratio
@@ -298,7 +286,6 @@ class _Measurement:
             if isinstance(self.prior, Imbalance) or rms > min(_SHORT_PX, 0.5 * last):
                 self.kept = None
             last = rms
-            self._lap("factor")
             if rms < stage.tolerance_px:
                 break
 
@@ -349,7 +336,6 @@ class _Measurement:
                 before, self.kept = cutoff, None  # the risk needs the matrix at u itself
                 self.tried = least_risk(self.linearised(), before, px, self._excess())
                 cutoff = best_of(self.tried)
-                self._lap("cut-off")
                 if abs(np.log(cutoff / before)) < _SETTLED:
                     break
         self.through(_Stage(FULL, cutoff, _LAST_TOLERANCE_PX))
@@ -377,7 +363,6 @@ class _Measurement:
                 "expected images that determine a displacement, got no finite one: too much of "
                 "the mesh, or of the mask, shows no speckle that is in both images; check them"
             )
-        self._lap("standard deviations")
         on = self._prepare(FULL)
         counts = np.diff(on.pixels.start)
         blank = float(counts[at.signal == 0.0].sum() / counts.sum())
@@ -404,7 +389,6 @@ class _Measurement:
             blur_px=on.blur,
             library=self.body.library,
             history=tuple(self.history),
-            timings_s=self.laps,
             warnings=self.warnings,
             contradicted=self.contradicted,
         )

@@ -45,8 +45,6 @@ _RIDGE = 1e-3
 def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelPair:
     """Make one level of a pair of images; on the finest, g continued by quadratic polynomials.
 
-    Parameters
-    ----------
     pair, level : as for :func:`modeharvest.idic.solver.pyramid.level_pair`.
     edge_px : pixels closer than this to the mask's edge are left out on the finest level [px].
     order : of the spline.
@@ -99,8 +97,6 @@ def continued_pixels(pair: ImagePair, noise_f: float) -> ContinuedPixels:
 def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     """Continue an image a few pixels beyond its material, by local quadratic fits.
 
-    Parameters
-    ----------
     image : (rows, cols) grey levels.
     mask : (rows, cols) True on material; farther than 4 px from it the nearest pixel's value is
         kept.
@@ -273,8 +269,6 @@ def normal_equations(
 ) -> NodalEquations:
     """Pass over all pixels.
 
-    Parameters
-    ----------
     pixels : of the level's reference, whose gradient there, pushed forward, weighs the residual;
         if they have none, that of the deformed image at x + u.
     mesh : T6.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -77,8 +76,7 @@ class NodalResult:
     library: str
     """That factorised the matrices."""
     history: tuple[Step, ...] = ()
-    timings_s: Mapping[str, float] = field(default_factory=dict)
-    """Every step; seconds by what they were spent on."""
+    """Every step."""
     warnings: tuple[str, ...] = ()
     """Sentences."""
     contradicted: float | None = None

@@ -310,8 +310,6 @@ class Smoothness:
 class Imbalance:
     """The forces of a T6 mesh that nothing balances; smallest in a body that obeys a law.
 
-    Parameters
-    ----------
     mesh : [mm].
     material : of the body, in plane strain.
     loaded : (n,) True at nodes on which unknown forces act.

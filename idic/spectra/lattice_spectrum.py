@@ -38,8 +38,6 @@ class MeshQuadrature:
     points per direction and element, see :func:`points_for`. Raises InputError if an element is
     turned inside out.
 
-    Attributes
-    ----------
     positions : (q, 2) points in the material [mm].
     weights : (q,) area that each stands for [mm^2], positive.
     area : of the material [mm^2].

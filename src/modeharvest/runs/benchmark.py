@@ -133,27 +133,14 @@ def score(
 ) -> Grading:
     """Grade displacement fields and write ``report.html``, ``scores.json`` and ``scores.csv``.
 
-    Parameters
-    ----------
-    fields
-        Their files, with what the files don't say themselves.
-    truth, out
-        The truth's folder, and that for the report.
-    strain
-        Nominal strain of the image that they were measured on [-].
-    edge_px
-        Material closer than this to a hole or to the outside counts as edge [px].
+    Fields that can't be read, are of another benchmark or in another unit than declared are among
+    the ``refused``, each with the reason. InputError if none can be graded, or two have one name.
 
-    Returns
-    -------
-    Grading
-        Of the fields that can be graded; those that can't be read, are of another benchmark or in
-        another unit than declared are in its ``refused``, each with the reason.
-
-    Raises
-    ------
-    InputError
-        If no field can be graded, or two have one name.
+    fields : their files, with what the files don't say themselves.
+    truth, out : the truth's folder, and that for the report.
+    strain : nominal strain of the image that they were measured on [-].
+    edge_px : material closer than this to a hole or to the outside counts as edge [px].
+    progress : listener.
     """
     from modeharvest.report.grades import write_grading
 
