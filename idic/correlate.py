@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -101,12 +100,11 @@ def correlate(
         ansatz = replace(ansatz, brightness=Brightness())  # which local normalisation takes away
     size_px = speckle_size(pair.reference, pair.mask)
     order = options.order or spline_order(size_px)
-    course.lap("check")
     reached = course.through(levels, pair, ansatz, a[: ansatz.size], order)
     result, reweighted = _assessed(reached, pair, size_px, course)
     progress(course.count, course.count, "correlate")
     history = (*history, *reached.found.history, *reweighted)
-    return replace(result, final_smoothing=smoothing, history=history, timings_s=course.laps)
+    return replace(result, final_smoothing=smoothing, history=history)
 
 
 def best_fit(
@@ -187,8 +185,7 @@ def fit_displacement(
         options,
         on_iteration=course.report,
     )
-    course.lap("iterate")
-    return replace(make_result(ansatz, grid, found), history=found.history, timings_s=course.laps)
+    return replace(make_result(ansatz, grid, found), history=found.history)
 
 
 def _initial_guess(
@@ -214,18 +211,11 @@ class _Reached:
 
 
 class _Course:
-    """A correlation on its way: its options, its progress, wall-clock seconds of each step."""
+    """A correlation on its way: its options and its progress."""
 
     def __init__(self, options: CorrelationOptions, progress: Progress) -> None:
         self.options, self.progress = options, progress
         self.count, self.done = 1, 0
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, step: str) -> None:
-        """Note that a step is done."""
-        now = time.perf_counter()
-        self.laps[step], self._last = now - self._last, now
 
     def report(self, number: int) -> None:
         """Tell the listener of an iteration."""
@@ -254,11 +244,9 @@ class _Course:
                 self.options.gauss_newton,
                 self.report,
             )
-            self.lap(f"prepare level {level.factor}")
             n = search.ansatz.size
             before = np.append(search.lower_cost(a[:n], before[:n]), a[n:])
             found, used = search.minimum(before[:n])
-            self.lap(f"iterate level {level.factor}")
             history += found.history
             a = np.append(found.unknowns, a[n:])
             self.done += 1
@@ -335,7 +323,6 @@ def _assessed(
     Returns the result, and the further steps alone.
     """
     result = _result(reached, reached.found, size_px)
-    course.lap("assess the residual")
     weighting = _weighting(result, size_px, course.options)
     search, used, found = reached.search, reached.used, reached.found
     without = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
@@ -345,7 +332,6 @@ def _assessed(
     found, how = search.reweighed(found, used, weights)
     weighted = (weighting, how) if found.outcome is Outcome.CONVERGED else ()
     result = _result(reached, found, size_px, *weighted)
-    course.lap("reweight")
     return result, found.history
 
 

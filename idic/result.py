@@ -62,8 +62,6 @@ class Result:
     """Of the column-scaled Gauss-Newton matrix."""
     history: tuple[Iteration, ...] = ()
     """Every iteration of every level."""
-    timings_s: Mapping[str, float] = field(default_factory=dict)
-    """Seconds for each step; not in a result's file, which two runs leave the same."""
     residual_correlation: float = float("nan")
     """Rms autocorrelation of the residual [-]: near 0 for noise; NaN for a fit to a displacement.
     See :meth:`residual_test`."""
@@ -307,7 +305,7 @@ def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-_STORED = tuple(f.name for f in fields(Result) if f.name != "timings_s")
+_STORED = tuple(f.name for f in fields(Result))
 _UNKNOWN = ("residual_correlation", "decorrelated_fraction")
 """Null is NaN there, and infinity elsewhere."""
 

@@ -36,7 +36,6 @@ def some_result(seed: int = 0, outcome: Outcome = Outcome.CONVERGED) -> Result:
         outcome=outcome,
         condition_number=1e5 / 7,
         history=(Iteration(8, 1, 0.1, 1 / 3, 1e-4, 99), Iteration(1, 1, 0.02, 2e-5, 0.0, 12345)),
-        timings_s={"prepare level 8": 0.1, "iterate level 8": 1 / 3},
     )
 
 
@@ -61,13 +60,6 @@ def test_a_file_holds_everything_exactly(outcome: Outcome, tmp_path: Path) -> No
     content = json.loads((tmp_path / "result.json").read_text())
     assert content["explanation"] == outcome.explanation
     assert content["unknowns"]["phi2.kx1"] == result.unknowns[result.names.index("phi2.kx1")]
-
-
-def test_a_file_holds_no_seconds_so_that_two_runs_leave_the_same(tmp_path: Path) -> None:
-    for number, seconds in enumerate((0.1, 0.2)):
-        one = replace(some_result(), timings_s={"prepare": seconds})
-        one.write(tmp_path / f"{number}.json")
-    assert (tmp_path / "0.json").read_bytes() == (tmp_path / "1.json").read_bytes()
 
 
 def test_a_result_that_knows_nothing_is_strict_json(tmp_path: Path) -> None:
