@@ -51,6 +51,8 @@ from modeharvest.util.scaled_eigen import ScaledEigen
 
 WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
 """Outcomes with nothing to assess."""
+_FINEST_PX = 4.0
+"""Finer speckle is aliased by the pixels; a filter keeps that out of what weighs the residual."""
 
 
 def correlate(
@@ -378,7 +380,3 @@ def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> W
         blur_px = best_blur(result.noise_to_slope, size_px, result.order) if is_noise else 0.0
         low_pass = is_aliased and not blur_px
     return Weighting(Gradient(gradient), blur_px, size_px, low_pass)
-
-
-_FINEST_PX = 4.0
-"""Finer speckle is aliased by the pixels; a filter keeps that out of what weighs the residual."""

@@ -14,6 +14,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.typed import nearest, picked
 
 _WIDEST_PX = 100
+FORMULATIONS = ("total", "updated")
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,6 @@ class CorrelationOptions:
                 f"expected edge_px from 0 to {_WIDEST_PX} and order 3, 5 or 11, got "
                 f"{self.edge_px} and {self.order}"
             )
-
-
-FORMULATIONS = ("total", "updated")
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,6 @@ of the taps, two values or four, has no weight; c has to be contiguous, and to h
 them: what is read to the right of the last column is that row's beginning.
 """
 
-
 PAD = 6
 """Rows and columns of mirrored coefficients around the image, so that no tap needs a test."""
 

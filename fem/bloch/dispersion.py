@@ -46,7 +46,6 @@ lattice under its load as it is. "rhombic": the hexagonal lattice under a load t
 0 and K′ at 60 degrees from x, M₁ at 30 and M₂ at 90. "oblique": anything else; with k and -k the
 same, the edges X-M and Y-M are all of the boundary."""
 
-
 _ARRAYS = ("waves", "distances", "loads", "eigenvalues")
 
 

@@ -38,6 +38,7 @@ _PROBE_SECONDS = 300.0
 _FARTHEST = 1e9
 """From the origin [mm]; a damaged file's nodes are anywhere."""
 _LOWER = ("vertex", "line")  # what meshes hold besides their elements
+_SIDES = ((0, 1), (1, 2), (2, 0))
 
 
 def read_cell(
@@ -260,9 +261,6 @@ def _lattice(given: ArrayLike | None, nodes: FloatArray) -> FloatArray:
     if given is None:
         return np.diag(np.ptp(nodes, axis=0))
     return lattice_vectors(given, "periodic cell")
-
-
-_SIDES = ((0, 1), (1, 2), (2, 0))
 
 
 def sound_t6(points: FloatArray, cells: IntArray) -> Mesh:

@@ -45,6 +45,10 @@ _STEP = 1.4
 _TINY = float(np.finfo(np.float64).tiny)
 _LEAST_PX, _MOST_PX = 6.0, 400.0
 """Shorter ones leave single nodes to what splines make of edges."""
+_STRONGER = 4.0
+"""Weight of the regularisation that shows its bias, over the weight used [-]."""
+_SIGNIFICANT = 3.0
+"""Standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +101,6 @@ def best_of(tried: tuple[Risk, ...]) -> float:
     low, here, high = (tried[i].value for i in (k - 1, k, k + 1))
     shift = 0.5 * (low - high) / (low - 2.0 * here + high)
     return max(float(tried[k].cutoff_px * _STEP**shift), _LEAST_PX)
-
-
-_STRONGER = 4.0
-"""Weight of the regularisation that shows its bias, over the weight used [-]."""
 
 
 class Deviations(NamedTuple):
@@ -160,10 +160,6 @@ def deviations(at: Linearised, cutoff: float, noise: float, unknowns: float) -> 
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
     error = interpolation_error(mesh, at.u.reshape(-1, 2))
     return Deviations(found, error, spread).with_bias(mesh, change)
-
-
-_SIGNIFICANT = 3.0
-"""Standard deviations."""
 
 
 def contradicted(

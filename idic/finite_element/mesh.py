@@ -38,7 +38,6 @@ _LEAST_SINE = 0.2
 _NARROWEST_PX = 3.0
 """Material between two holes that can still be meshed."""
 
-
 _SECONDS, _SECONDS_PER_ELEMENT = 60.0, 2e-3
 """That gmsh may take: many times what it takes where no outlines cross."""
 _LEAST_ISLAND, _LEAST_HOLE = 4.0, 0.25
@@ -52,6 +51,8 @@ _ISLANDS_NAMED = 3
 Loops = tuple[tuple[FloatArray, ...], ...]
 """Of an island, the outer one first: curves (k, 2) of (column, -row) [px], whose corners are where
 one curve ends."""
+_REVERSED = {"T3": [0, 2, 1], "T6": [0, 2, 1, 5, 4, 3]}
+"""Node numbers the other way round."""
 
 
 class MeshedMaterial(NamedTuple):
@@ -208,10 +209,6 @@ def quadratic(mesh: Mesh) -> Mesh:
         )
     require_positive_jacobian(mesh.nodes, mesh.cells, mesh.element, "mesh of the material")
     return mesh
-
-
-_REVERSED = {"T3": [0, 2, 1], "T6": [0, 2, 1, 5, 4, 3]}
-"""Node numbers the other way round."""
 
 
 def _twice_area(nodes: FloatArray, cells: IntArray) -> FloatArray:

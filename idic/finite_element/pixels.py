@@ -40,6 +40,10 @@ _SIGMA_PX = 1.5
 _WINDOW_PX = 6
 _RIDGE = 1e-3
 """Against polynomials that too few pixels determine, of the sum of weights."""
+_LEAST_SIGNAL = 0.5
+"""Of signal in the slopes of an element; with less than that they may be nothing but noise."""
+_BEYOND_PX = 2
+"""How far from the mesh the edge of a mask may be, along rows and columns."""
 
 
 def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelPair:
@@ -139,10 +143,6 @@ def _continue(
         out[i, j] = b[0] / A[0, 0]
 
 
-_LEAST_SIGNAL = 0.5
-"""Of signal in the slopes of an element; with less than that they may be nothing but noise."""
-
-
 class ElementPixels(NamedTuple):
     """The pixels that count, element by element."""
 
@@ -192,10 +192,6 @@ class MeshPixels:
         xi = located.values.reshape(2, -1)[:, flat].astype(np.float32)
         none = np.empty((2, 0), np.float32)
         return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, none[0], none)
-
-
-_BEYOND_PX = 2
-"""How far from the mesh the edge of a mask may be, along rows and columns."""
 
 
 def _require_cover(covered: BoolArray, mask: BoolArray) -> None:

@@ -233,14 +233,11 @@ def _run(python: str, folder: Path, pair: ImagePair, arguments: dict[str, Any]) 
     mask = pair.masks[0]
     np.savez(folder / "request.npz", f=f, g=g, mask=mask, arguments=json.dumps(arguments))
     quiet = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "OMP_NUM_THREADS")}
+    # pyvale leaves a log where it is run.
     done = subprocess.run(
-        [python, str(_SIDE), str(folder)],
-        cwd=folder,  # pyvale leaves a log where it is run
-        capture_output=True,
-        text=True,
-        env=quiet,
+        [python, str(_SIDE), str(folder)], cwd=folder, env=quiet, capture_output=True, text=True,
         check=False,
-    )
+    )  # fmt: skip
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     named = [line for line in lines if "Error" in line]
     if done.returncode < 0:

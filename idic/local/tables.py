@@ -222,7 +222,6 @@ _READERS: dict[str, Callable[[Path], Table]] = {
     **dict.fromkeys((".vtk", ".vtu", ".vtp"), _read_vtk),
 }
 
-
 ROLES = ("x", "y", "u", "v")
 ALL_ROLES = (*ROLES, "sd_u", "sd_v", "sigma", "valid")
 

@@ -21,6 +21,9 @@ from modeharvest.util.errors import InputError
 
 _MUCH_SMALLER = 0.25
 """Openings below this share of the typical area are scratches, bubbles and noise."""
+_ALIKE = 0.25
+"""Vectors this near to each other, as a share of the pitch, stand for one of the lattice's, and
+holes for a place in it: locally, strain differs by 10 %, and holes are moulded a little off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +78,6 @@ def _typical(areas: FloatArray) -> float:
     """The area above which half of all the hole area lies: many specks don't change it."""
     ordered = np.sort(areas)[::-1]
     return float(ordered[np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())])
-
-
-_ALIKE = 0.25
-"""Vectors this near to each other, as a share of the pitch, stand for one of the lattice's, and
-holes for a place in it: locally, strain differs by 10 %, and holes are moulded a little off."""
 
 
 def spanning_vectors(spots: FloatArray) -> FloatArray | None:

@@ -29,9 +29,10 @@ _OTHER_STATE = 0.25
 _MOTION = 2.0
 """Times the noise that a single image shows, beyond which motion is the likelier cause."""
 
-
 GIVEN = "given"
 """Source of a noise that the experiment's file states."""
+_REACH = 24
+"""How far from a pixel the spline through it is looked at [px]."""
 
 
 @dataclass(frozen=True)
@@ -219,10 +220,6 @@ def _variances(order: int, phase: FloatArray) -> tuple[FloatArray, FloatArray]:
     at = np.arange(_PHASES + 1) / _PHASES
     value, slope = _table(order)
     return np.interp(phase, at, value), np.interp(phase, at, slope)
-
-
-_REACH = 24
-"""How far from a pixel the spline through it is looked at [px]."""
 
 
 @cache

@@ -77,7 +77,6 @@ IMAGES = -1
 NO_INSTRUMENT = np.zeros((3, 0, 0), dtype=np.float32)
 """``instrument`` where the deformed image itself weighs the residual."""
 
-
 COLUMN, KNOWN, U_X, U_Y, GAIN, OFFSET, AT_ROW, AT_COL, G, D_ROW, D_COL, WEIGHT = range(12)
 INSTRUMENT = 12
 """Rows of :class:`Block`'s ``own``."""

@@ -172,7 +172,6 @@ LEAST_BLUR_PX = 0.6
 _BLURS_PX = tuple(LEAST_BLUR_PX + 0.05 * k for k in range(69))
 """Up to 4 px."""
 
-
 _FAR = 10.0
 """Steps longer than that many times the first one: it runs away."""
 _REACH_PX = 48

@@ -34,6 +34,7 @@ IN_PHASE = 0.02
 zone's boundary is in phase to rounding where the cell has an inversion centre."""
 POLARISED = 0.1
 """Sine of the angle up to which a wave is called transverse or longitudinal."""
+_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
 @dataclass(frozen=True)
@@ -172,9 +173,6 @@ def _amplitude_column(tie: Tie, waves: list[RealWave]) -> FloatArray:
         sign = np.sign(waves[w].amplitude[tie.component])
         column[w, :2] = sign * waves[w].frame[tie.component]
     return column.ravel()
-
-
-_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
 def describe(

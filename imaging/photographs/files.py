@@ -31,6 +31,15 @@ _TIFF = {".tif", ".tiff"}
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it would print beside our line
 _ORIENTATION = 274
 """The tag of TIFF and of Exif."""
+_TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "mirrored about its diagonal",
+    6: "turned clockwise by 90 degrees",
+    7: "mirrored about its other diagonal",
+    8: "turned anticlockwise by 90 degrees",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,17 +189,6 @@ def _png_is_deep_colour(path: Path) -> bool:
     with path.open("rb") as file:
         header = file.read(26)
     return header[12:16] == b"IHDR" and header[24] == 16 and header[25] in (2, 6)
-
-
-_TURNS = {
-    2: "mirrored left to right",
-    3: "turned by 180 degrees",
-    4: "mirrored top to bottom",
-    5: "mirrored about its diagonal",
-    6: "turned clockwise by 90 degrees",
-    7: "mirrored about its other diagonal",
-    8: "turned anticlockwise by 90 degrees",
-}
 
 
 def _turn_note(orientation: int) -> str:

@@ -154,7 +154,6 @@ FACTORS: dict[str, VariedFactor] = {
 }  # fmt: skip
 """By the names that a study uses."""
 
-
 BASE = "base"
 ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
 

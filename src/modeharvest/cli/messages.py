@@ -53,7 +53,6 @@ SolutionFile = Annotated[
     ),
 ]
 
-
 _NOT_KEPT = (
     "every time: neither the package's folder nor the home folder can be written to; "
     "NUMBA_CACHE_DIR may name one that can"
@@ -112,7 +111,6 @@ console = Console(stderr=True)
 UNUSABLE, FAULT, INTERRUPTED, UNREAD = 2, 70, 130, 1
 """Exit codes: of input or an environment that can't be used; of a fault in the program (EX_SOFTWARE
 of sysexits.h); after Ctrl-C; where nobody reads what is printed (as in ``| head``)."""
-
 
 was_interrupted = False
 """Set by Ctrl-C, whose exception can get lost: Python drops it in destructors and callbacks, numba

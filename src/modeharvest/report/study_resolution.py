@@ -30,6 +30,8 @@ from modeharvest.validation.studies.transfer import (
 
 _SIZE = (4.6, 3.3)  # [in]
 _DEGREES: Colormap = mpl.colormaps["viridis"]
+_KEPT = 0.85
+"""Share of a wave that is found, from which on images are set against best fits apart [-]."""
 
 
 def noise_floors(done: pd.DataFrame, spec: ResolutionSpec) -> pd.DataFrame:
@@ -147,10 +149,6 @@ def _colour(degree: int, degrees: Sequence[int]) -> tuple[float, ...]:
     """From dark to bright with the degree."""
     low, high = min(degrees), max(degrees)
     return _DEGREES(0.9 * (degree - low) / max(1, high - low))
-
-
-_KEPT = 0.85
-"""Share of a wave that is found, from which on images are set against best fits apart [-]."""
 
 
 def _text(found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame) -> tuple[str, ...]:

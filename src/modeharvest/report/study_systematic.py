@@ -24,6 +24,8 @@ ERROR_LABELS = {
 }
 
 MOVED = "moved from the base [px]"
+_FAR, _NEAR = 0.1, 0.01
+"""Factors that move the measurement by more, or by less, are listed apart [px]."""
 
 
 def by_level(found: SystematicAnalysis) -> pd.DataFrame:
@@ -111,10 +113,6 @@ def report_systematic(found: SystematicAnalysis, seeds: str) -> Findings:
             ReportTable.of_frame("Every level", levels.drop(columns="number")),
         ],
     )
-
-
-_FAR, _NEAR = 0.1, 0.01
-"""Factors that move the measurement by more, or by less, are listed apart [px]."""
 
 
 def _short(factor: str) -> str:

@@ -51,6 +51,9 @@ from modeharvest.validation.whole_field import compare_whole, v_percent
 
 _SIDECAR = "twin.json"
 _EXPERIMENT = resources.files(__package__).joinpath("twin_experiment.txt").read_text("utf-8")
+_WAVES, _AMPLITUDE, _LENS_PX = 1.0, 3.0, 0.05
+"""What must come out: wave vectors within 1 %, v1 within 3 % of the best fit's maximum, S within
+0.05 px rms without its affine part."""
 
 
 @dataclass(frozen=True)
@@ -154,11 +157,6 @@ def _experiment_text(case: Case, images: ImageSet) -> str:
         title=case.title, deformed=deformed, about=about, pixel_size=case.imaging.pixel_size,
         cell_size=case.experiment.specimen.pitch,
     )  # fmt: skip
-
-
-_WAVES, _AMPLITUDE, _LENS_PX = 1.0, 3.0, 0.05
-"""What must come out: wave vectors within 1 %, v1 within 3 % of the best fit's maximum, S within
-0.05 px rms without its affine part."""
 
 
 @dataclass(frozen=True)

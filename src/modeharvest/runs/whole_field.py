@@ -38,6 +38,8 @@ from modeharvest.validation.whole_field import (
 
 BYTES_PER_PIXEL = 420.0
 """Of memory while an image is measured: 1.6 GB were measured for one of 4 Mpx."""
+_REFUSED = 2
+"""Exit code for an InputError."""
 
 
 @dataclass(frozen=True)
@@ -253,10 +255,6 @@ def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
         finally:
             for child in children:
                 child.kill()
-
-
-_REFUSED = 2
-"""Exit code for an InputError."""
 
 
 def _main() -> None:

@@ -162,7 +162,6 @@ LATTICES: dict[str, type[Any]] = {
     "file": FileLattice,
 }
 
-
 Component = float | Literal["free"]
 _ZERO = ((0.0, 0.0), (0.0, 0.0))
 

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+DRAWN_AMPLITUDE = 0.16
+"""Largest displacement that modes are drawn with [l]."""
 
 
 def combination_name(combination: Sequence[float] | FloatArray) -> str:
@@ -47,10 +49,6 @@ def combination_name(combination: Sequence[float] | FloatArray) -> str:
         text += " − " if c < 0 else " + "
         text += ("" if alike else f"{abs(c):.2g} ") + f"φ{k}".translate(_SUBSCRIPTS)
     return text[3:] if text.startswith(" + ") else "−" + text[3:]
-
-
-DRAWN_AMPLITUDE = 0.16
-"""Largest displacement that modes are drawn with [l]."""
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ PREPARED_FILE = "prepared.json"
 LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 CODE = ("fem", "imaging", "idic", "runs")
 """What numbers from photographs depend on: libraries, and folders of the package."""
+_ARRAYS = "shifts shifts_sd angles angles_sd matches covariance"
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,9 +178,6 @@ class Optics:
     """S of the paper's Eq. (r2); None for none."""
     calibration: Calibration | None = None
     """How it was found, if it wasn't given."""
-
-
-_ARRAYS = "shifts shifts_sd angles angles_sd matches covariance"
 
 
 def calibrate_lens(
