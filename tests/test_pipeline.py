@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import re
 import shutil
 import subprocess
@@ -166,7 +167,9 @@ def test_an_input_error_of_another_process_is_one_here(share: Share) -> None:
         pytest.raises(InputError, match="expected a finished image set"),
         whole_field._children(1) as [child],
     ):
-        whole_field._hand_to(child, share)
+        assert child.stdin
+        with child.stdin as to:
+            pickle.dump(share, to)
 
 
 def test_a_killed_process_is_no_fault_of_the_program() -> None:
