@@ -162,14 +162,18 @@ def share(tmp_path: Path) -> Share:
     return partial(whole_field._measure, files, tmp_path / "none", body, options, True, {})
 
 
+def hand(share: Share, child: subprocess.Popen[bytes]) -> None:
+    assert child.stdin
+    with child.stdin as to:
+        pickle.dump(share, to)
+
+
 def test_an_input_error_of_another_process_is_one_here(share: Share) -> None:
     with (
         pytest.raises(InputError, match="expected a finished image set"),
         whole_field._children(1) as [child],
     ):
-        assert child.stdin
-        with child.stdin as to:
-            pickle.dump(share, to)
+        hand(share, child)
 
 
 def test_a_killed_process_is_no_fault_of_the_program() -> None:
