@@ -8,6 +8,7 @@ imports this module and the case's function, nothing else of a campaign: it must
 
 from __future__ import annotations
 
+import gc
 import importlib
 import logging
 import multiprocessing
@@ -240,16 +241,17 @@ def _processes(count: int, memory: str) -> Iterator[Any]:
 
 
 def _begun(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Make a cluster or a client; again if its event loop is slow to begin.
-
-    Dask asserts that the loop's thread runs within 10 s, which it does not on a busy machine.
-    """
-    for _ in range(_ATTEMPTS - 1):
+    """Make a cluster or a client; again if its event loop takes more than dask's 10 s to begin."""
+    for left in reversed(range(_ATTEMPTS)):
+        gc.collect()
+        gc.disable()  # a client that failed, collected within, would close and wait for this one
         try:
             return make(*arguments, **options)
         except AssertionError:
-            continue
-    return make(*arguments, **options)
+            if not left:
+                raise
+        finally:
+            gc.enable()
 
 
 @contextmanager
