@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import socket
@@ -268,6 +269,12 @@ def test_a_run_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     (tmp_path / "go").touch()
     assert campaign.run()["error"].eq("").all()
     assert all(path.read_bytes() == content for path, content in finished.items())
+
+
+def test_nothing_is_collected_while_a_client_begins() -> None:
+    """A client that failed closes when collected: within another's start that never ends."""
+    assert not workers._begun(gc.isenabled)
+    assert gc.isenabled()
 
 
 def test_an_event_loop_that_is_slow_to_begin_is_begun_again(
