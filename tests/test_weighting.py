@@ -334,6 +334,8 @@ def test_bad_options(change: dict[str, object], words: str) -> None:
 def test_bad_weighting() -> None:
     with pytest.raises(InputError, match="at least 0 px"):
         Weighting(blur_px=-0.1)
+    with pytest.raises(InputError, match="known size for a low-pass filter.*inf"):
+        Weighting(Gradient.REFERENCE, low_pass=True)  # its response was nan at half the sampling
 
 
 SMALL = Ansatz(Box.centred(1.4, 1.5), v0_degree=1)

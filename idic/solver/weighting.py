@@ -86,10 +86,11 @@ class Weighting:
     """Whether that image's rows and columns are filtered, see :meth:`passed`."""
 
     def __post_init__(self) -> None:
-        if not (self.blur_px >= 0 and self.speckle_size_px > 0):
+        is_cut = not self.low_pass or self.speckle_size_px < np.inf  # where depends on the size
+        if not (self.blur_px >= 0 and self.speckle_size_px > 0 and is_cut):
             raise InputError(
-                "expected a blur of at least 0 px and a speckle wider than 0 px, "
-                f"got {self.blur_px} and {self.speckle_size_px}"
+                "expected a blur of at least 0 px and a speckle wider than 0 px, of known size for "
+                f"a low-pass filter, got {self.blur_px} and {self.speckle_size_px}"
             )
 
     @property
