@@ -334,7 +334,7 @@ def test_bad_options(change: dict[str, object], words: str) -> None:
 def test_bad_weighting() -> None:
     with pytest.raises(InputError, match="at least 0 px"):
         Weighting(blur_px=-0.1)
-    with pytest.raises(InputError, match="known size for a low-pass filter.*inf"):
+    with pytest.raises(InputError, match="known size for a low-pass filter"):
         Weighting(Gradient.REFERENCE, low_pass=True)  # its response was nan at half the sampling
 
 
