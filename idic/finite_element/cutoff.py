@@ -15,15 +15,16 @@ than smoothing too much: Y.-J. Kim, C. Gu, J. R. Stat. Soc. B 66 (2004), doi
 displacements are made, over its variance at the pixels: interpolated noise is smoother than that of
 the pixels.
 
-The covariance by noise is s^2 A^-1 M A^-1. What smoothing takes away is estimated by what a weight
-four times as large changes, in the mean square around each node. Where there is no speckle nothing
-changes that, and the smoothest displacement shows no noise: there it counts what the regularisation
-lets a displacement do, s^2 lambda A^-1 R A^-1 (G. Wahba, J. R. Stat. Soc. B 45 (1983), doi
-10.1111/j.2517-6161.1983.tb01239.x), by how much of the slopes around a node is noise. With a
-material law a larger weight says little, because errors of a law are the same at all long
-wavelengths. There the truth is taken to be at most as far from the solution with the law as that
-without it is, d, and most probably with it, which adds the variance d^2/6 of a triangular
-distribution (Guide to the Expression of Uncertainty in Measurement, JCGM 100, 4.3.9).
+The covariance by noise is A^-1 C A^-1, C that of the gradient: s_f^2 h_0 h_0' + s_g^2 h h'/det F
+summed over the pixels, h_0 being h without its noise (see ``solver.weighting``). What smoothing
+takes away is estimated by what a weight four times as large changes, in the mean square around each
+node. Where there is no speckle nothing changes that, and the smoothest displacement shows no noise:
+there it counts what the regularisation lets a displacement do, s^2 lambda A^-1 R A^-1 (G. Wahba, J.
+R. Stat. Soc. B 45 (1983), doi 10.1111/j.2517-6161.1983.tb01239.x), by how much of the slopes around
+a node is noise. With a material law a larger weight says little, because errors of a law are the
+same at all long wavelengths. There the truth is taken to be at most as far from the solution with
+the law as that without it is, d, and most probably with it, which adds the variance d^2/6 of a
+triangular distribution (Guide to the Expression of Uncertainty in Measurement, JCGM 100, 4.3.9).
 """
 
 from __future__ import annotations
@@ -129,7 +130,9 @@ class Deviations(NamedTuple):
         )
 
 
-def deviations(at: Linearised, cutoff: float, noise: float, unknowns: float) -> Deviations:
+def deviations(
+    at: Linearised, cutoff: float, noise: float, in_gradient: FloatArray, unknowns: float
+) -> Deviations:
     """Estimate what noise and smoothing make of u.
 
     By noise, A^-1 e for random e of the covariance M times that of the noise, more of it in
@@ -137,21 +140,21 @@ def deviations(at: Linearised, cutoff: float, noise: float, unknowns: float) -> 
     speckle; by smoothing, what a larger weight changes, and the elements' own error.
 
     cutoff : wavelength [mm].
-    noise : its standard deviation at long wavelengths [grey levels].
+    noise : its standard deviation in the residual [grey levels].
+    in_gradient : (m,) its variance in each element's gradient over that [-].
     unknowns : their effective number.
     """
-    mesh = at.body.mesh
-    weight = at.weight(cutoff)
+    mesh, weight, here = at.body.mesh, at.weight(cutoff), at.step(cutoff)
     factor = at.factor(weight)
-    here = at.step(cutoff)
-    random = at.body.samples(at.sums.blocks * at.sums.excess[:, None, None, None])
+    scale = (at.sums.excess * in_gradient)[:, None, None, None]
+    random = at.body.samples(at.sums.blocks * scale)
     found = noise * factor.solve(random).reshape(-1, 2, SAMPLES)
     if isinstance(at.prior, Smoothness):  # what a law allows there is not known
         blank = mean_around(mesh, np.repeat(1.0 - at.signal, 6).reshape(-1, 6))
         # The roughness that was found is that of so many unknowns, or the weight is too large.
         grown = float((at.u - at.prior.start) @ at.penalty)
         rough = weight * grown / max(noise**2 * unknowns, _TINY)
-        wide = noise * np.sqrt(weight * blank * max(1.0, rough))
+        wide = noise * np.sqrt(weight * blank * max(at.mean(in_gradient), rough))
         found += wide[:, None, None] * factor.solve(at.body.smoothness_samples).reshape(
             -1, 2, SAMPLES
         )

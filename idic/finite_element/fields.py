@@ -147,7 +147,7 @@ def deviation_of(
 
 def nodal_gradient(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     """(n, c, 2) gradient of nodal fields (n, c), the mean of the elements around each node."""
-    return mean_around(mesh, _element_gradients(mesh, nodal)[0])
+    return mean_around(mesh, element_gradients(mesh, nodal)[0])
 
 
 def interpolation_error(mesh: Mesh, nodal: FloatArray) -> FloatArray:
@@ -156,14 +156,14 @@ def interpolation_error(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     The gradients of neighbours differ by that of the error, a wave from node to node, h/2 apart in
     elements of sides h: its rms is h/(4 pi) times that of its gradient.
     """
-    gradients, areas = _element_gradients(mesh, nodal)
+    gradients, areas = element_gradients(mesh, nodal)
     off = gradients - mean_around(mesh, gradients)[mesh.cells]
     square = (off**2).sum(axis=-1).mean(axis=1) * (4.0 / np.sqrt(3.0) * areas)[:, None]
     around = mean_around(mesh, np.repeat(square[:, None], mesh.cells.shape[1], axis=1))
     return np.asarray(np.sqrt(around) / (4.0 * np.pi))
 
 
-def _element_gradients(mesh: Mesh, nodal: FloatArray) -> tuple[FloatArray, FloatArray]:
+def element_gradients(mesh: Mesh, nodal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(m, k, c, 2) gradients at the nodes of elements, (m,) areas of these [mm^2]."""
     local = shape_gradients(mesh.element, reference_element(mesh.element).nodes)
     F = np.einsum("eki,qkj->eqij", mesh.nodes[mesh.cells], local)

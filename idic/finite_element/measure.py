@@ -24,6 +24,7 @@ from modeharvest.idic.finite_element.cutoff import (
     least_risk,
     risk,
 )
+from modeharvest.idic.finite_element.fields import determinant, element_gradients
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import (
     NONE_CONTINUED,
@@ -42,12 +43,12 @@ from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
 from modeharvest.idic.solver.weighting import best_blur
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.progress import Progress, counted, silent
+from modeharvest.util.typed import picked
 
 _FIRST_PX = 18.0
 """Cut-off wavelength from which on the best one is sought [px]."""
@@ -61,6 +62,8 @@ _BLANK = 0.01
 _SHORT_PX = 0.1
 """After shorter steps the matrices are kept, where only the images make them change and steps get
 shorter; rms over the nodes [px]."""
+_LEAST_DET = 0.1
+"""Elements that shrink to less are an iteration gone astray."""
 _ROUNDS = 3
 _SETTLED = 0.5
 """Relative change of the cut-off wavelength that needs no other round."""
@@ -114,10 +117,9 @@ class FiniteElementOptions:
 
     def __post_init__(self) -> None:
         what = "finite-element DIC: expected"
-        require_within(f"{what} element_px", self.element_px, 4.0)
-        require_within(f"{what} edge_element_px", self.edge_element_px, 4.0)
-        require_within(f"{what} edge_px", self.edge_px, 0)
-        require_within(f"{what} steps", self.steps, 1)
+        least = {"element_px": 4.0, "edge_element_px": 4.0, "edge_px": 0, "steps": 1}
+        for name, value in least.items():
+            require_within(f"{what} {name}", getattr(self, name), value)
         if self.cutoff_px is not None:
             require_within(f"{what} cutoff_px", self.cutoff_px, 0.0, above=True)
 
@@ -153,13 +155,11 @@ def measure_displacement(
     progress : listener.
     """
     course = _Measurement(pair, start, on, options or FiniteElementOptions())
-    count = len(_STAGES) + 1
-    for k, stage in enumerate(_STAGES):
-        progress(k, count, "whole displacement")
-        course.through(stage)
-    progress(count - 1, count, "whole displacement")
-    course.regularise()
-    progress(1, 1, "whole displacement")
+    for stage in counted((*_STAGES, None), progress, "whole displacement"):
+        if stage is None:
+            course.regularise()
+        else:
+            course.through(stage)
     return course.result()
 
 
@@ -216,6 +216,9 @@ class _Measurement:
         self.contradicted: float | None = None
         self.tried: tuple[Risk, ...] = ()
         self.warnings = body.changes
+        images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
+        self.noise = tuple(estimated_noise(image, mask).sd ** 2 for image, mask in images)
+        """Variances of the noise of f and g [grey levels^2]."""
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = spline_order(self.speckle_px)
 
@@ -234,7 +237,7 @@ class _Measurement:
         f, mask, px = self.pair.reference, self.pair.masks[0], self.pair.grid.pixel_size
         spline = SplineImage.of(continued(f, mask), self.order)
         _, d_row, d_col = spline.sample(on.pixels.row, on.pixels.col)
-        noise = estimated_noise(f, mask).sd ** 2
+        noise, noise_g = self.noise
         square = 0.5 * float(np.mean(d_row**2 + d_col**2)) - noise * slope_noise(self.order, 0.0)
         blur = best_blur(noise / max(square, 0.2 * square), self.speckle_px, self.order)
         if blur > 0.0:
@@ -244,7 +247,7 @@ class _Measurement:
         return replace(
             on, pixels=on.pixels._replace(slope=slope), blur=blur,
             slope_noise=noise * slope_noise(self.order, blur) / px**2,
-            continued=continued_pixels(self.pair, noise),
+            continued=continued_pixels(self.pair, noise, noise_g),
         )  # fmt: skip
 
     def linearised(self) -> Linearised:
@@ -257,16 +260,19 @@ class _Measurement:
             raise InputError("expected pixels of the material in both images, got none in common")
         R, penalty = self.prior.linearised(self.u)
         if kept is None:
-            signal = sums.signal(on.slope_noise)
-            blocks = signal[:, None, None, None] ** 2 * sums.blocks
+            F = self._deformation_gradient()
+            pushed = (F**2).sum(axis=(1, 2)) / np.maximum(determinant(F), _LEAST_DET) ** 2
+            signal, gain = sums.signal(on.slope_noise * pushed)
+            blocks = (gain * signal[:, None, None, None]) ** 2 * sums.blocks
             M = body.matrix(blocks)
             ratio = body.energies(M) / body.energies(R)
         else:
-            blocks, M, signal, ratio = kept.sums.blocks, kept.M, kept.signal, kept.ratio
-        gradient = body.vector(signal[:, None, None] * sums.gradient)
+            blocks, M, ratio = kept.sums.blocks, kept.M, kept.ratio
+            signal, gain = kept.signal, kept.gain
+        gradient = body.vector(gain * signal[:, None, None] * sums.gradient)
         sums = replace(sums, blocks=blocks)
         self.kept = Linearised(
-            body, self.prior, self.u, sums, signal, M, gradient, R, penalty, ratio
+            body, self.prior, self.u, sums, signal, gain, M, gradient, R, penalty, ratio
         )
         return self.kept
 
@@ -303,10 +309,10 @@ class _Measurement:
 
     def _assessed(self) -> tuple[Linearised, Risk, Deviations]:
         """What there is at the present displacement."""
-        at, excess, px = self.linearised(), self._excess(), self.pair.grid.pixel_size
-        here = risk(at, self.cutoff_px, px, excess)
-        noise = here.noise * np.sqrt(excess)
-        return at, here, deviations(at, self.cutoff_px * px, noise, here.unknowns)
+        at, px = self.linearised(), self.pair.grid.pixel_size
+        noise = self._noise_in(at)
+        here = risk(at, self.cutoff_px, px, at.mean(noise))
+        return at, here, deviations(at, self.cutoff_px * px, here.noise, noise, here.unknowns)
 
     def _against_law_free(self, sd: Deviations) -> Deviations:
         """Count the difference to the law-free solution as bias; notice a law that is wrong."""
@@ -334,25 +340,30 @@ class _Measurement:
             for _ in range(_ROUNDS):
                 self.through(_Stage(FULL, cutoff))
                 before, self.kept = cutoff, None  # the risk needs the matrix at u itself
-                self.tried = least_risk(self.linearised(), before, px, self._excess())
+                at = self.linearised()
+                self.tried = least_risk(at, before, px, at.mean(self._noise_in(at)))
                 cutoff = best_of(self.tried)
                 if abs(np.log(cutoff / before)) < _SETTLED:
                     break
         self.through(_Stage(FULL, cutoff, _LAST_TOLERANCE_PX))
         self.cutoff_px = cutoff
 
-    def _excess(self) -> float:
-        """What noise has at long wavelengths over its variance in the residual [-]."""
-        mesh, u = self.body.mesh, self.u.reshape(-1, 2)
-        N, local = (make(mesh.element, np.full((1, 2), 1.0 / 3.0))[0]
-                    for make in (shape_functions, shape_gradients))  # fmt: skip
-        X, x = mesh.nodes[mesh.cells], (mesh.nodes + u)[mesh.cells]
-        det = np.linalg.det(np.einsum("eki,kj->eij", x, local)) / np.linalg.det(
-            np.einsum("eki,kj->eij", X, local)
-        )
-        middle = np.einsum("k,eki->ei", N, u[mesh.cells]) / self.pair.grid.pixel_size
-        transfer = NoiseTransfer.at(middle, det, self.order)
-        return (1.0 + transfer.density) / (1.0 + transfer.value)
+    def _deformation_gradient(self) -> FloatArray:
+        """(m, 2, 2) F of each element [-]."""
+        gradients, _ = element_gradients(self.body.mesh, self.u.reshape(-1, 2))
+        return np.asarray(np.eye(2) + gradients.mean(axis=1))
+
+    def _noise_in(self, at: Linearised) -> FloatArray:
+        """(m,) variance of noise in each element's gradient, over that of the residual's [-].
+
+        That of f has nothing to do with its own slopes, so only their signal counts; g's counts
+        with all, and by 1/det F at the long wavelengths of which displacements are made.
+        """
+        u, det = self.u.reshape(-1, 2)[self.body.mesh.cells], self._deformation_gradient()
+        det = np.maximum(determinant(det), _LEAST_DET)
+        value = NoiseTransfer.at(u.mean(axis=1) / self.pair.grid.pixel_size, det, self.order).value
+        f, g = self.noise if any(self.noise) else (1.0, 1.0)
+        return np.asarray((f * at.signal + g / det) / (f + g * value))
 
     def result(self) -> NodalResult:
         """Make the result, with its standard deviations."""
@@ -374,21 +385,16 @@ class _Measurement:
         return NodalResult(
             mesh=self.body.mesh,
             displacement=self.u.reshape(-1, 2),
-            start=self.start,
             standard_deviation=np.hypot(sd.by_noise, sd.bias),
             noise_deviation=sd.by_noise,
             gradient_covariance=sd.gradient,
             grid=self.pair.grid,
-            cutoff_px=self.cutoff_px,
-            tried=self.tried,
             residual_rms=at.sums.rms,
             residual_noise=here.noise,
-            pixels=at.sums.pixels,
-            outside=at.sums.outside,
             effective_unknowns=here.unknowns,
             blur_px=on.blur,
             library=self.body.library,
             history=tuple(self.history),
-            warnings=self.warnings,
-            contradicted=self.contradicted,
+            **picked(self, "start cutoff_px tried warnings contradicted"),
+            **picked(at.sums, "pixels outside"),
         )

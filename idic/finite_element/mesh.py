@@ -235,22 +235,18 @@ def outlines(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
         area = 0.5 * float(np.sum(points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
         row, col = np.rint(contour[0]).astype(int)
         island = int(islands[tuple(nearest[:, row, col])])
-        if abs(area) < (_LEAST_ISLAND if _is_outer(area) else _LEAST_HOLE) * element_px**2:
+        # Of material inside a contour the signed area is positive, x right and y up.
+        if abs(area) < (_LEAST_ISLAND if area > 0.0 else _LEAST_HOLE) * element_px**2:
             continue
         loops.setdefault(island, []).append((area, points + np.array([-8.0, 8.0])))
     parts = []
     for found in (loops[k] for k in sorted(loops)):
         outer = max(found, key=lambda loop: abs(loop[0]))
-        if not _is_outer(outer[0]):
+        if outer[0] <= 0.0:
             continue  # a hole of an island that is too small itself
         others = [loop for loop in found if loop is not outer]
         parts.append(tuple(_smooth(points, element_px) for _, points in (outer, *others)))
     return tuple(parts)
-
-
-def _is_outer(area: float) -> bool:
-    """Whether material lies inside a contour of this signed area, x right and y up."""
-    return area > 0.0
 
 
 def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, eroded, level_pair
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
@@ -42,6 +41,7 @@ _RIDGE = 1e-3
 """Against polynomials that too few pixels determine, of the sum of weights."""
 _LEAST_SIGNAL = 0.5
 """Of signal in the slopes of an element; with less than that they may be nothing but noise."""
+_TINY = float(np.finfo(np.float64).tiny)
 _BEYOND_PX = 2
 """How far from the mesh the edge of a mask may be, along rows and columns."""
 
@@ -76,24 +76,24 @@ _LARGEST_VARIANCE = 1e6
 """Of continued pixels where there is no noise [-]."""
 
 
-def continued_pixels(pair: ImagePair, noise_f: float) -> ContinuedPixels:
+def continued_pixels(pair: ImagePair, noise_f: float, noise_g: float) -> ContinuedPixels:
     """Estimate the continued pixels' variance from the outermost pixels of the material.
 
-    ``noise_f``: variance of the reference's noise [grey levels^2].
+    ``noise_f``, ``noise_g``: variances of the images' noise [grey levels^2].
     """
     g, mask = pair.deformed, pair.deformed_mask
     if mask is None or mask.all():
         return NONE_CONTINUED
     inside = ndimage.binary_erosion(mask, border_value=1)
     outermost = mask & ~inside
-    noise_g, ratio = estimated_noise(g, mask).sd ** 2, _LARGEST_VARIANCE
+    ratio = _LARGEST_VARIANCE
     if inside.any():
         found, (rows, cols) = np.empty(g.shape, np.float32), np.nonzero(outermost)
         of_material = readable(g), readable(inside)
         in_parallel(_continue, *of_material, readable(rows), readable(cols), found)
         error = float(np.mean((found[outermost] - g[outermost]) ** 2))
         # The tried pixel has noise itself, and so would have the one that is missing.
-        excess, noise = max(0.0, error - 2.0 * noise_g), float(noise_f + noise_g)
+        excess, noise = max(0.0, error - 2.0 * noise_g), noise_f + noise_g
         ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
     return ContinuedPixels((~mask).astype(np.float32), ratio)
 
@@ -219,6 +219,8 @@ class NodalEquations:
     counts: FloatArray
     weights: FloatArray
     """(m,) of how many pixels, and the sums of their weights."""
+    slopes: FloatArray
+    """(m, 2) sums of |h|^2 and of h grad g at x + u [grey levels^2/mm^2]; 0 if these are one."""
     outside: int
     """Pixels mapped to where g isn't valid."""
 
@@ -239,20 +241,23 @@ class NodalEquations:
 
     @property
     def excess(self) -> FloatArray:
-        """(m,) mean of r^2 in an element over that in all, at least 1 [-]."""
-        mean, least = self.squares / np.maximum(self.counts, 1.0), np.finfo(np.float64).tiny
-        return np.asarray(np.maximum(mean * self.pixels / max(self.square_sum, least), 1.0))
+        """(m,) mean of r^2 in an element over that in all, if significantly larger; or 1 [-]."""
+        counts = np.maximum(self.counts, 1.0)
+        ratio = self.squares / counts * self.pixels / max(self.square_sum, _TINY)
+        return np.where(ratio > 1.0 + 2.0 * np.sqrt(2.0 / counts), ratio, 1.0)
 
-    def signal(self, noise: float) -> FloatArray:
-        """(m,) share of each element's slopes that is signal, from 0 to 1.
+    def signal(self, noise: FloatArray) -> tuple[FloatArray, float]:
+        """(m,) share of each element's slopes that is signal, 0 to 1; grad g over h, at least 1.
 
-        ``noise``: variance of the slopes h that is noise [grey levels^2/mm^2]. Such slopes show no
-        displacement: of a sum of h h' only that share is what an element's residual changes by.
+        ``noise`` (m,): mean of |h|^2 by noise [grey levels^2/mm^2]. Such slopes show nothing: of a
+        sum of h h' that share is what a residual changes by, or more if a blur has flattened h.
         """
         slopes = self.blocks[:, [0, 2]].sum(axis=(1, 2, 3))  # shape functions sum to 1
-        signal = 1.0 - 2.0 * noise * self.weights / np.maximum(slopes, np.finfo(np.float64).tiny)
+        signal = 1.0 - noise * self.weights / np.maximum(slopes, _TINY)
         signal[(signal < _LEAST_SIGNAL) | (slopes <= 0.0)] = 0.0
-        return np.asarray(signal)
+        square, product = self.slopes.sum(axis=0)
+        alone = max(square - noise @ self.counts, _LEAST_SIGNAL * square, _TINY)
+        return signal, float(max(1.0, product / alone))
 
 
 def normal_equations(
@@ -273,23 +278,23 @@ def normal_equations(
     continued_in_g : pixels of the deformed image that are continued, by which residuals weigh.
     with_blocks : whether the blocks are needed, which take most of the time.
     """
-    m = len(mesh.cells)
+    m, g = len(mesh.cells), level.deformed
     blocks = np.zeros((m if with_blocks else 0, 3, 6, 6))
-    gradient, sums = np.zeros((m, 6, 2)), np.zeros((m, 4))
+    gradient, sums = np.zeros((m, 6, 2)), np.zeros((m, 6))
     valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
-    g, share = level.deformed, 1.0 if pixels.slope.size else 0.0
     in_parallel(
         accumulate_elements, pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order,
-        valid, *continued_in_g, level.grid.pixel_size, share, blocks, gradient, sums,
+        valid, *continued_in_g, level.grid.pixel_size, blocks, gradient, sums,
     )  # fmt: skip
-    squares, counts, outside, weights = sums.T
-    return NodalEquations(blocks, gradient, squares, counts, weights, int(outside.sum()))
+    squares, counts, outside, weights = sums.T[:4]
+    lost, slopes = int(outside.sum()), sums[:, 4:]
+    return NodalEquations(blocks, gradient, squares, counts, weights, slopes, lost)
 
 
 @compiled(relaxed=True)
 def accumulate_elements(
     pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, outside: Any,
-    variance: float, pixel_size: float, share: float, blocks: Any, gradient: Any, sums: Any,
+    variance: float, pixel_size: float, blocks: Any, gradient: Any, sums: Any,
     thread: int, threads: int,
 ) -> None:  # fmt: skip
     """Fill each element's own sums of products over its pixels."""
@@ -301,8 +306,8 @@ def accumulate_elements(
             n = min(_BLOCK, pixels.start[e + 1] - begin)
             _shapes(pixels.xi, begin, n, N)
             _sample(pixels, begin, n, N, u[e], coefficients, order, valid, pixel_size, own, sums[e])
-            if share > 0.0:
-                _push_forward(pixels, begin, n, x[e], u[e], share, own)
+            if pixels.slope.size:
+                _push_forward(pixels, begin, n, x[e], u[e], own, sums[e])
             if outside.size:
                 _weigh(n, outside, variance, own)
             for m in range(n):
@@ -352,8 +357,8 @@ def _sample(
 
 
 @compiled(relaxed=True)
-def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, share: float, own: Any) -> None:
-    """Mix F^-T grad f into the gradient of a block."""
+def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, own: Any, sums: Any) -> None:
+    """Put F^-T grad f in the place of grad g in a block; sum its square and both' product."""
     for m in range(n):
         s, t = float(pixels.xi[0, begin + m]), float(pixels.xi[1, begin + m])
         r = 1.0 - s - t
@@ -373,8 +378,10 @@ def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, share: float,
         if det > 0.0 and own[3, m] > 0.0:
             f_x, f_y = float(pixels.slope[0, begin + m]), float(pixels.slope[1, begin + m])
             f_s, f_t = f_x * X_s + f_y * Y_s, f_x * X_t + f_y * Y_t
-            own[0, m] += share * ((f_s * y_t - f_t * y_s) / det - own[0, m])
-            own[1, m] += share * ((f_t * x_s - f_s * x_t) / det - own[1, m])
+            h_x, h_y = (f_s * y_t - f_t * y_s) / det, (f_t * x_s - f_s * x_t) / det
+            sums[4] += h_x * h_x + h_y * h_y
+            sums[5] += h_x * own[0, m] + h_y * own[1, m]
+            own[0, m], own[1, m] = h_x, h_y
 
 
 @compiled(relaxed=True)

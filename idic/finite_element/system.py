@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
@@ -62,25 +62,13 @@ class NodalPattern:
         rows = np.concatenate([np.repeat(g, g.shape[1], axis=1).ravel() for g in groups])
         cols = np.concatenate([np.tile(g, (1, g.shape[1])).ravel() for g in groups])
         one = np.ones(rows.size, dtype=np.int8)
-        joined = csr_array(coo_array((one, (rows, cols)), shape=(count, count)))
-        joined.sum_duplicates()
-        joined.sort_indices()
+        joined = csr_array((one, (rows, cols)), shape=(count, count))  # sorted, each once
         return cls(joined.indptr.astype(np.int64), joined.indices.astype(np.int64))
 
     def assembled(self, nodes: IntArray, blocks: FloatArray) -> csr_array:
         """(2 n, 2 n) sums of symmetric blocks (m, 3, k, k), xx, xy, yy, over their nodes (m, k)."""
         parts = np.zeros((3, self.indices.size))
         _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), parts)
-        return self.matrix(parts)
-
-    def both(self, matrix: csr_array) -> csr_array:
-        """(2 n, 2 n) of a matrix (n, n) of either component, with this pattern."""
-        rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-        own = np.repeat(np.arange(self.indptr.size - 1), np.diff(self.indptr))
-        n = self.indptr.size - 1
-        at = np.searchsorted(own * n + self.indices, rows * n + matrix.indices)
-        parts = np.zeros((3, self.indices.size))
-        parts[0, at] = parts[2, at] = matrix.data
         return self.matrix(parts)
 
     def matrix(self, parts: FloatArray) -> csr_array:
@@ -189,15 +177,10 @@ class SmoothnessRoots(NamedTuple):
         roots = np.concatenate([second_part, first_part.reshape(*nodes.shape, 4)], axis=2)
         return cls(len(mesh.nodes), nodes, roots)
 
-    def matrix(self) -> csr_array:
-        """(n, n) R of one component [1/mm^4]; sorted indices."""
-        nodes, k = self.nodes, self.nodes.shape[1]
-        blocks = self.roots @ self.roots.swapaxes(1, 2)
-        at = np.repeat(nodes, k, axis=1).ravel(), np.tile(nodes, (1, k)).ravel()
-        total = csr_array((blocks.ravel(), at), shape=(self.size, self.size))
-        total.sum_duplicates()
-        total.sort_indices()
-        return total
+    def matrix(self, pattern: NodalPattern) -> csr_array:
+        """(2 n, 2 n) R of both components [1/mm^4]."""
+        own = self.roots @ self.roots.swapaxes(1, 2)
+        return pattern.assembled(self.nodes, np.stack([own, np.zeros_like(own), own], axis=1))
 
     def samples(self, count: int) -> FloatArray:
         """(2 n, count) random vectors whose covariance is R of both components [1/mm^2]."""
@@ -224,7 +207,7 @@ class Body:
         """(rows, cols) True on pixels that count, None for those of any mask; what was left out."""
         roots = SmoothnessRoots.of(mesh)
         self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, roots.nodes)
-        self.smoothness = self.pattern.both(roots.matrix())
+        self.smoothness = roots.matrix(self.pattern)
         self.smoothness_samples = roots.samples(SAMPLES)
         """(2 n, 2 n) R of both components, and (2 n, SAMPLES) random vectors of that covariance."""
         edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
@@ -363,7 +346,8 @@ class Linearised:
     sums: NodalEquations
     """Over the pixels; the blocks weighed, and perhaps of another displacement close by."""
     signal: FloatArray
-    """(m,) see :meth:`NodalEquations.signal`; its square weighs the blocks."""
+    gain: float
+    """See :meth:`NodalEquations.signal`; the square of their product weighs the blocks."""
     M: csr_array
     gradient: FloatArray
     """(2 n, 2 n) and (2 n,): sums of h h' and of h r, so weighed."""
@@ -372,6 +356,10 @@ class Linearised:
     """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
     ratio: float
     """Of M to R, by the body's waves."""
+
+    def mean(self, values: FloatArray) -> float:
+        """Mean over the pixels of values (m,) of the elements."""
+        return float(values @ self.sums.counts) / self.sums.pixels
 
     def weight(self, cutoff: float) -> float:
         """The weight lambda of R for a cut-off wavelength [mm]."""
