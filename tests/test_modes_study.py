@@ -19,7 +19,7 @@ from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.spectra.mode_family import wave_sum
-from modeharvest.report.study_modes import report_modes
+from modeharvest.report.studies.modes import report_modes
 from modeharvest.runs.case import shipped_solution
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError

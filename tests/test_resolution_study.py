@@ -18,7 +18,7 @@ from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
-from modeharvest.report.study_resolution import measured_waves, noise_floors, report_resolution
+from modeharvest.report.studies.resolution import measured_waves, noise_floors, report_resolution
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies.buckled import LARGEST, AddedWave, BuckledMotion, ResolutionSpec

@@ -19,9 +19,9 @@ from test_cli import called, error_line
 
 from modeharvest.fem.field import Solution
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.report.study_noise import report_noise
-from modeharvest.report.study_robustness import report_robustness
-from modeharvest.report.study_systematic import report_systematic
+from modeharvest.report.studies.noise import report_noise
+from modeharvest.report.studies.robustness import report_robustness
+from modeharvest.report.studies.systematic import report_systematic
 from modeharvest.runs.case import shipped_cases, shipped_solution
 from modeharvest.runs.study import StudyAnalysis, StudyCase
 from modeharvest.util.errors import InputError

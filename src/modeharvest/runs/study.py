@@ -18,11 +18,11 @@ from pydantic import model_validator
 
 from modeharvest.fem.field import Solution
 from modeharvest.report.model import Findings, study_report, write_page, write_tables
-from modeharvest.report.study_modes import report_modes
-from modeharvest.report.study_noise import report_noise
-from modeharvest.report.study_resolution import report_resolution
-from modeharvest.report.study_robustness import report_robustness
-from modeharvest.report.study_systematic import report_systematic
+from modeharvest.report.studies.modes import report_modes
+from modeharvest.report.studies.noise import report_noise
+from modeharvest.report.studies.resolution import report_resolution
+from modeharvest.report.studies.robustness import report_robustness
+from modeharvest.report.studies.systematic import report_systematic
 from modeharvest.runs.case import Case, of_kind, read_tables, with_kind
 from modeharvest.runs.experiment import Run
 from modeharvest.util.errors import InputError

@@ -1,0 +1,1 @@
+"""Reports of studies: what a table of many cases shows, in numbers, sentences and figures."""
