@@ -75,6 +75,7 @@ class FreeBody:
         # Position in dolfinx's order of every component in the order of the nodes.
         self._order = np.rint(numbers).astype(np.int64).ravel()
         self._tangent: Any = None
+        self._reordering: tuple[Any, ...] = ()
 
     def energy(self, u: FloatArray) -> float:
         """Stored energy per unit thickness [N] at displacements ``u`` (n, 2) [mm]."""
@@ -106,6 +107,11 @@ class FreeBody:
 
     def _reordered(self, matrix: Any) -> csr_array:
         indptr, indices, values = matrix.getValuesCSR()
-        place = np.argsort(self._order)
-        rows = np.repeat(place, np.diff(indptr))
-        return csr_array((values, (rows, place[indices])), shape=(len(place),) * 2)
+        shape = (len(self._order),) * 2
+        if not self._reordering:  # all matrices of a body have one pattern
+            place, numbers = np.argsort(self._order), np.arange(len(values))
+            rows = np.repeat(place, np.diff(indptr))
+            found = csr_array((numbers, (rows, place[indices])), shape)
+            self._reordering = found.data, found.indices, found.indptr
+        order, indices, indptr = self._reordering
+        return csr_array((values[order], indices, indptr), shape)

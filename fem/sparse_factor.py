@@ -1,4 +1,4 @@
-"""Factorisation of sparse symmetric positive definite matrices of one pattern, by a library.
+"""Factorisation of sparse symmetric matrices of one pattern, by a library, and their inertia.
 
 MUMPS through petsc4py, which is there beside dolfinx, finds the order of elimination once for all
 matrices of a pattern. Without it SciPy's SuperLU does the work, in several times as long.
@@ -29,24 +29,29 @@ class Factor(Protocol):
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Solve for one right-hand side (n,) or for several (n, k)."""
 
+    @property
+    def negative_pivots(self) -> int:
+        """Number of negative eigenvalues, by Sylvester's law of inertia."""
 
-def factorise(matrix: csr_array, library: str | None = None) -> Factor:
-    """Factorise a symmetric positive definite matrix, of sorted indices.
+
+def factorise(matrix: csr_array, library: str | None = None, definite: bool = True) -> Factor:
+    """Factorise a symmetric matrix, of sorted indices.
 
     ModuleNotFoundError if the library named isn't there. ArithmeticError if the matrix is singular,
     here or in an update.
 
     matrix : (n, n), both triangles.
     library : a name among ``LIBRARIES``; by default MUMPS if it is there.
+    definite : whether all matrices are known to be positive definite; else L D L^T, with pivoting.
     """
     best = "mumps" if find_spec("petsc4py") else "superlu"
-    return LIBRARIES[library or best](matrix)
+    return LIBRARIES[library or best](matrix, definite)
 
 
 class _Mumps:
     library = "MUMPS"
 
-    def __init__(self, matrix: csr_array) -> None:
+    def __init__(self, matrix: csr_array, definite: bool) -> None:
         from petsc4py import PETSc
 
         # The arrays are shared, so that new values need no call for each row.
@@ -57,7 +62,7 @@ class _Mumps:
         )
         shape = matrix.shape
         self._matrix = PETSc.Mat().createAIJWithArrays(shape, self._arrays, comm=PETSc.COMM_SELF)
-        self._matrix.setOption(PETSc.Mat.Option.SPD, True)
+        self._matrix.setOption(PETSc.Mat.Option.SPD, definite)
         self._pc = PETSc.PC().create(PETSc.COMM_SELF)
         self._pc.setOperators(self._matrix)
         self._pc.setType(PETSc.PC.Type.CHOLESKY)
@@ -65,8 +70,8 @@ class _Mumps:
         self._pc.setFactorSetUpSolverType()
         self._factor = self._pc.getFactorMatrix()
         self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
-        self._factor.setMumpsIcntl(14, 60)  # room for fill-in [%]
-        self._vectors = self._matrix.createVecs()
+        self._factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
+        self._factor.setMumpsIcntl(14, 60 if definite else 200)  # room for fill-in and pivoting [%]
         self.update(matrix)
 
     def update(self, matrix: csr_array) -> None:
@@ -80,22 +85,21 @@ class _Mumps:
     def solve(self, rhs: FloatArray) -> FloatArray:
         from petsc4py import PETSc
 
-        if rhs.ndim == 1:
-            b, x = self._vectors
-            b.array[:] = rhs
-            self._factor.solve(b, x)
-            return np.array(x.array)
-        columns = np.asfortranarray(rhs)
-        b = PETSc.Mat().createDense(rhs.shape, array=columns, comm=PETSc.COMM_SELF)
+        columns = np.asfortranarray(rhs.reshape(len(rhs), -1))
+        b = PETSc.Mat().createDense(columns.shape, array=columns, comm=PETSc.COMM_SELF)
         x = b.duplicate()
         self._factor.matSolve(b, x)
-        return np.array(x.getDenseArray())
+        return np.array(x.getDenseArray()).reshape(rhs.shape)
+
+    @property
+    def negative_pivots(self) -> int:
+        return int(self._factor.getMumpsInfog(12))
 
 
 class _SuperLU:
     library = "SuperLU"
 
-    def __init__(self, matrix: csr_array) -> None:
+    def __init__(self, matrix: csr_array, definite: bool) -> None:
         self.update(matrix)
 
     def update(self, matrix: csr_array) -> None:
@@ -110,5 +114,19 @@ class _SuperLU:
     def solve(self, rhs: FloatArray) -> FloatArray:
         return np.asarray(self._factor.solve(rhs))
 
+    @property
+    def negative_pivots(self) -> int:
+        return negative_pivots(self._factor)
 
-LIBRARIES: dict[str, Callable[[csr_array], Factor]] = {"mumps": _Mumps, "superlu": _SuperLU}
+
+def negative_pivots(factor: Any) -> int:
+    """Number of negative eigenvalues of a Hermitian matrix by its factor of SuperLU.
+
+    An ArithmeticError where a zero pivot made SuperLU leave the diagonal: signs mean nothing then.
+    """
+    if not np.array_equal(factor.perm_r, factor.perm_c):
+        raise ArithmeticError("a zero pivot: the matrix is singular or nearly so")
+    return int(np.count_nonzero(factor.U.diagonal().real < 0))
+
+
+LIBRARIES: dict[str, Callable[[csr_array, bool], Factor]] = {"mumps": _Mumps, "superlu": _SuperLU}

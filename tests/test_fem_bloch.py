@@ -24,7 +24,7 @@ from modeharvest.fem.bloch.critical import (
 )
 from modeharvest.fem.bloch.dispersion import ZONES, zone_path
 from modeharvest.fem.bloch.eigen import BlochWaves, scan
-from modeharvest.fem.lattice.bloch_map import Condensation, factorise, negative_pivots
+from modeharvest.fem.lattice.bloch_map import Condensation, factorise
 from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.options import (
@@ -37,6 +37,7 @@ from modeharvest.fem.lattice.options import (
 )
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.meshing import join, rectangle
+from modeharvest.fem.sparse_factor import negative_pivots
 from modeharvest.util.errors import InputError
 
 refined = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks/refinement.py"))[

@@ -17,8 +17,12 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 200, 42_500
-"""See docs/decisions/0014-size.md."""
+MOST_MODULES, MOST_LINES = 198, 42_100
+"""See docs/decisions/0014-size.md; of everything that has no bound of its own."""
+
+HOMOGENIZATION = ("fem/lattice/micromorphic", "fem/lattice/cell.py", "fem/sparse_factor.py")
+OWN_BOUNDS = {HOMOGENIZATION: (9, 1_790)}
+"""Modules and lines of capabilities that came later, with the modules that they are built into."""
 
 PRIVATE_WORDS = """
     told judged leftover softness softened pushes unmatched trapped landed levelled marched
@@ -52,9 +56,15 @@ def names(module: Path) -> Iterator[tuple[int, str]]:
 
 
 def test_there_are_few_modules_and_lines() -> None:
-    lines = [len(path.read_text(encoding="utf-8").splitlines()) for path in modules()]
-    assert len(lines) <= MOST_MODULES
-    assert sum(lines) <= MOST_LINES
+    sizes = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in modules()}
+    for places, (most_modules, most_lines) in OWN_BOUNDS.items():
+        roots = [PROJECT / place for place in places]
+        own = [path for path in sizes if any(path.is_relative_to(root) for root in roots)]
+        lines = [sizes.pop(path) for path in own]
+        assert len(lines) <= most_modules
+        assert sum(lines) <= most_lines
+    assert len(sizes) <= MOST_MODULES
+    assert sum(sizes.values()) <= MOST_LINES
 
 
 def test_a_folder_can_be_taken_in_at_a_glance() -> None:

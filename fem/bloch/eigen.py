@@ -23,10 +23,10 @@ from modeharvest.fem.lattice.bloch_map import (
     CondensedWaves,
     applied,
     factorise,
-    negative_pivots,
 )
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
 from modeharvest.fem.lattice.options import Wave, wave_of
+from modeharvest.fem.sparse_factor import negative_pivots
 from modeharvest.util.arrays import FloatArray
 
 _SCAN_TOLERANCE = 1e-10  # of lambda + s, relative

@@ -26,6 +26,7 @@ from scipy.sparse.linalg import splu
 
 from modeharvest.fem.lattice.options import CENTRE, Wave
 from modeharvest.fem.lattice.periodicity import Periodicity
+from modeharvest.fem.sparse_factor import negative_pivots
 from modeharvest.util.arrays import FloatArray, IntArray
 
 Batch = NDArray[Any]  # of real or complex numbers
@@ -222,16 +223,6 @@ def factorise(matrix: csc_array, order: str = "NATURAL") -> Any:
     options = {"SymmetricMode": True, "Equil": False}
     # Small supernodes suit matrices of some thousand rows.
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=1, options=options)
-
-
-def negative_pivots(factor: Any) -> int:
-    """Number of negative eigenvalues of the factorised Hermitian matrix (law of inertia).
-
-    An ArithmeticError where a zero pivot made SuperLU leave the diagonal: signs mean nothing then.
-    """
-    if not np.array_equal(factor.perm_r, factor.perm_c):
-        raise ArithmeticError("a zero pivot: the matrix is singular or nearly so")
-    return int(np.count_nonzero(factor.U.diagonal().real < 0))
 
 
 class Condensation:

@@ -11,16 +11,16 @@ prescribed it is regular on a branch however near to the point where it leaves t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
 from modeharvest.fem.hyperelastic import FreeBody
-from modeharvest.fem.lattice.bloch_map import Reduction, factorise, negative_pivots
+from modeharvest.fem.lattice.bloch_map import Reduction
 from modeharvest.fem.lattice.cells import UnitCell
 from modeharvest.fem.lattice.options import CENTRE, MacroLoading
 from modeharvest.fem.materials import Material
+from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.util.arrays import FloatArray
 
 # Forces must be smaller than what a change of the load by this would make.
@@ -58,7 +58,65 @@ class Amplitude:
     """[mm]."""
 
 
-class LinearisedCell:
+class CondensedCell:
+    """The equations of a cell at a trial state, its fluctuation condensed by one factorisation.
+
+    The displacement u is ``carriers`` (2 n, s) times generalised strains, F̄ first, and a periodic
+    w with ``constraints`` . w = 0. All forces and moduli are those of the whole cell.
+
+    forces, macro_forces : (free,) on w, without those of the constraints [N/mm], and (s,) on the
+        generalised strains.
+    relaxed, response : (2 count,) change of w that balances it, (2 count, s) its derivatives.
+    condensed : (s, s) moduli with w in equilibrium; ``is_regular``: whether there are any.
+    negative : number of negative eigenvalues of the tangent in w, at fixed strains.
+    """
+
+    def __init__(
+        self,
+        cell: PeriodicCell,
+        carriers: FloatArray,
+        u: FloatArray,
+        constraints: FloatArray | None = None,
+        violation: FloatArray | float = 0.0,
+    ) -> None:
+        self._cell, self._carriers, self._u = cell, carriers, u
+        self._constraints, self._violation = constraints, violation
+        forces = cell.body.forces(u)
+        self.macro_forces = carriers.T @ forces
+        self.forces = cell.reduction.restricted(forces)[cell.free_dofs]
+        self._all_forces = self.forces
+        if constraints is not None:
+            self.forces = self.forces - constraints.T @ (constraints @ self.forces)
+        self.is_regular = bool(np.isfinite(forces).all())
+        if self.is_regular:
+            self._condense()
+
+    def _condense(self) -> None:
+        cell, carriers, C = self._cell, self._carriers, self._constraints
+        self.stiffness = cell.body.stiffness(self._u)
+        self.on_carriers = self.stiffness @ carriers
+        coupling = cell.reduction.restricted(self.on_carriers)[cell.free_dofs]
+        try:
+            factor = cell.factor(self.stiffness)
+        except ArithmeticError:  # exactly singular
+            self.is_regular = False
+            return
+        known = [self._all_forces, coupling] if C is None else [self._all_forces, coupling, C.T]
+        solved = -factor.solve(np.column_stack(known))
+        self.negative = factor.negative_pivots
+        if C is not None:
+            solved, held = solved[:, : -len(C)], solved[:, -len(C) :]
+            size = C @ held  # negative definite where the constrained tangent is as K
+            missing = C @ solved
+            missing[:, 0] += self._violation
+            solved = solved - held @ np.linalg.solve(size, missing)
+            self.negative += int(np.sum(np.linalg.eigvalsh(0.5 * (size + size.T)) < 0)) - len(C)
+        self.relaxed, self.response = cell.every(solved[:, 0]), cell.every(solved[:, 1:])
+        self.condensed = carriers.T @ self.on_carriers + coupling.T @ solved[:, 1:]
+        self.relaxed_forces = self.macro_forces + coupling.T @ solved[:, 0]
+
+
+class LinearisedCell(CondensedCell):
     """The equations of a cell at a trial state of load [-], F̄ (4,) and w (2 count,) [mm]."""
 
     def __init__(
@@ -70,34 +128,15 @@ class LinearisedCell:
         fluctuation: FloatArray,
         amplitude: Amplitude | None = None,
     ) -> None:
-        self.cell, self.loading, self.load, self.amplitude = cell, loading, load, amplitude
+        self.loading, self.load, self.amplitude = loading, load, amplitude
         self.gradient, self.fluctuation, self.area = gradient, fluctuation, cell.cell.area
-        u = cell.displaced(gradient, fluctuation)
-        forces = cell.body.forces(u)
-        self.forces = cell.reduction.restricted(forces)[cell.free_dofs]
-        self.macro_forces = cell.affine.T @ forces
-        self.is_regular = bool(np.isfinite(forces).all())
+        super().__init__(cell, cell.affine, cell.displaced(gradient, fluctuation))
         if self.is_regular:
-            self._eliminate(cell.body.stiffness(u))
-
-    def _eliminate(self, stiffness: csr_array) -> None:
-        """Condense the fluctuation: how it, and the forces, follow F̄ and the load."""
-        cell = self.cell
-        self.stiffness, self.on_affine = stiffness, stiffness @ cell.affine
-        self.coupling = cell.reduction.restricted(self.on_affine)[cell.free_dofs]
-        try:
-            self._factor = cell.factor(stiffness)
-        except RuntimeError:  # SuperLU: exactly singular
-            self.is_regular = False
-            return
-        self.response = -self._factor.solve(self.coupling)
-        self.condensed = cell.affine.T @ self.on_affine + self.coupling.T @ self.response
-        free = self.loading.free
-        self.rate = self.loading.rate
-        self.rate[free] = np.linalg.solve(
-            self.condensed[np.ix_(free, free)],
-            (self.area * self.loading.dead - self.condensed @ self.rate)[free],
-        )
+            free, self.rate = loading.free, loading.rate
+            self.rate[free] = np.linalg.solve(
+                self.condensed[np.ix_(free, free)],
+                (self.area * loading.dead - self.condensed @ self.rate)[free],
+            )
 
     @property
     def _unbalanced(self) -> FloatArray:
@@ -109,7 +148,7 @@ class LinearisedCell:
     def is_solved(self) -> bool:
         """Whether forces, internal and macroscopic, balance, and the amplitude is met."""
         size, amplitude = np.linalg.norm, self.amplitude
-        inner = _LOAD_TOLERANCE * size(self.on_affine @ self.rate)
+        inner = _LOAD_TOLERANCE * size(self.on_carriers @ self.rate)
         outer = _LOAD_TOLERANCE * size(self.condensed) * size(self.rate)
         is_met = True
         if amplitude is not None:
@@ -122,24 +161,24 @@ class LinearisedCell:
 
     def step(self) -> tuple[float, FloatArray, FloatArray]:
         """Newton's changes of the load, of F̄ (4,) and of the fluctuation."""
-        free, relaxed = np.flatnonzero(self.loading.free), -self._factor.solve(self.forces)
+        free = np.flatnonzero(self.loading.free)
         # Unknown are the free components of F̄ and, if an amplitude is prescribed, the load.
         along: FloatArray = np.zeros((4, len(free) + 1))
         along[free, np.arange(len(free))] = 1.0
         along[:, -1] = self.loading.rate
         stiffness: FloatArray = self.condensed[free] @ along
         stiffness[:, -1] -= self.area * self.loading.dead[free]
-        rest = (self._unbalanced + self.coupling.T @ relaxed)[free]
+        rest = (self._unbalanced + self.relaxed_forces - self.macro_forces)[free]
         if self.amplitude is None:
             along, stiffness = along[:, :-1], stiffness[:, :-1]
         else:
-            weights = self.amplitude.weights[self.cell.free_dofs]
+            weights = self.amplitude.weights
             stiffness = np.vstack([stiffness, weights @ self.response @ along])
-            rest = np.append(rest, self._excess(self.amplitude) + weights @ relaxed)
+            rest = np.append(rest, self._excess(self.amplitude) + weights @ self.relaxed)
         unknown = np.linalg.solve(stiffness, -rest)
         dF = along @ unknown
         change = 0.0 if self.amplitude is None else float(unknown[-1])
-        return change, dF, self._full(relaxed + self.response @ dF)
+        return change, dF, self.relaxed + self.response @ dF
 
     def state(self) -> CellState:
         """The state reached, with its rates and moduli."""
@@ -148,16 +187,11 @@ class LinearisedCell:
             gradient=self.gradient.reshape(2, 2),
             gradient_rate=self.rate.reshape(2, 2),
             fluctuation=self.fluctuation,
-            fluctuation_rate=self._full(self.response @ self.rate),
+            fluctuation_rate=self.response @ self.rate,
             stress=np.asarray(self.macro_forces.reshape(2, 2) / self.area),
             stiffness=self.stiffness,
             moduli=self.condensed.reshape(2, 2, 2, 2) / self.area,
         )
-
-    def _full(self, values: FloatArray) -> FloatArray:
-        every = np.zeros(self.cell.reduction.size)
-        every[self.cell.free_dofs] = values
-        return every
 
 
 _ITERATIONS = 12
@@ -187,6 +221,11 @@ class PeriodicCell:
         modes = [(X[:, 0], zero), (X[:, 1], zero), (zero, X[:, 0]), (zero, X[:, 1])]
         self.affine = np.stack([np.stack(m, axis=1).ravel() for m in modes], axis=1)
         self.free_dofs = self.reduction.order // 2 != 0  # master 0 is fixed
+        dofs = np.flatnonzero(self.free_dofs)
+        whole = self.mass(CENTRE)
+        numbers = self.reduction.assembled(np.arange(1.0, whole.nnz + 1.0))
+        self._free_entries = csr_array(numbers[dofs][:, dofs])
+        self._factor: Factor | None = None
 
     def displacement(self, state: CellState) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes, affine part included [mm]."""
@@ -242,13 +281,27 @@ class PeriodicCell:
         free = loading.free
         moduli = state.moduli.reshape(4, 4)[np.ix_(free, free)]
         outer = np.linalg.eigvalsh(0.5 * (moduli + moduli.T))
-        return negative_pivots(self.factor(state.stiffness)) + int(np.sum(outer < 0))
+        return self.factor(state.stiffness).negative_pivots + int(np.sum(outer < 0))
 
-    def factor(self, stiffness: csr_array) -> Any:
-        """Factorise the stiffness (2 n, 2 n) of the free fluctuations; RuntimeError if singular."""
+    def factor(self, stiffness: csr_array) -> Factor:
+        """Factorise the stiffness (2 n, 2 n) of the free fluctuations; the same object again.
+
+        ArithmeticError if it is singular.
+        """
         self.factorisations += 1
-        dofs = np.flatnonzero(self.free_dofs)
-        return factorise(csc_array(self.reduction.reduced(stiffness)(CENTRE)[dofs][:, dofs]))
+        matrix, whole = self._free_entries.copy(), self.reduction.reduced(stiffness)(CENTRE)
+        matrix.data = whole.data[self._free_entries.data.astype(np.int64) - 1]
+        if self._factor is None:
+            self._factor = factorise(matrix, definite=False)
+        else:
+            self._factor.update(matrix)
+        return self._factor
+
+    def every(self, values: FloatArray) -> FloatArray:
+        """(2 count, ...) values of the free unknowns (free, ...), zero at the others."""
+        every = np.zeros((self.reduction.size, *values.shape[1:]))
+        every[self.free_dofs] = values
+        return every
 
     def displaced(self, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes for F̄ (4,) and w (2 count,) [mm]."""

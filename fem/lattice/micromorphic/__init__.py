@@ -1,0 +1,1 @@
+"""Micromorphic homogenization: patterns given beforehand, at two scales solved as one."""

@@ -1,0 +1,378 @@
+"""A homogenized body: finite elements of u, v_i and their gradients, with RVEs at their points.
+
+    div P̄ = 0,    div Lambda_i - Pi_i = 0,
+
+weakly, with u and all v_i interpolated alike. Every quadrature point of the lattice has one RVE, or
+several in different positions whose mean counts; solid bulk has its material. Both scales are
+linearised together: one factorisation an RVE and iteration, then one of the body. RVEs
+are shared out over the ranks of a communicator; everything else every rank has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import csr_array
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.micromorphic.elements import Quadrature, quadrature, specimen_mesh
+from modeharvest.fem.lattice.micromorphic.options import PlateLoading
+from modeharvest.fem.lattice.micromorphic.rve import RVE
+from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
+from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.fem.specimen import Specimen
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.errors import InputError
+
+_FIRST_ORDER = 4  # generalised strains without modes: F̄
+
+
+class _Region(NamedTuple):
+    """Elements of one kind, lattice or bulk."""
+
+    at: Quadrature
+    B: FloatArray
+    """(c, p, s, d) generalised strains of unit unknowns."""
+    dofs: IntArray
+    """(c, d) of all unknowns."""
+
+
+class HomogenizedBody:
+    """A body of a homogenized lattice, perhaps with solid bulk, between two plates.
+
+    Unknown are ``free_count`` numbers y; all unknowns a are those or follow the load. Nodal values
+    are ``displacement(a)`` (n, 2) [mm] and ``amplitudes(a)`` (n, m), NaN in bulk. An InputError
+    refuses RVEs with differing numbers of modes, supports that leave it loose, and more ranks
+    than RVEs.
+
+    mesh : T3, T6, Q4, Q8 or Q9 [mm].
+    rves : one, or several that are averaged at every point.
+    length : L, which the load refers to [mm]; by default the distance of the plates.
+    bulk, is_lattice : material of solid elements, and which (m,) are not solid; by default all.
+    points : Gauss points a direction.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        rves: RVE | Sequence[RVE],
+        loading: PlateLoading,
+        length: float | None = None,
+        bulk: Material | None = None,
+        is_lattice: BoolArray | None = None,
+        points: int = 2,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+    ) -> None:
+        self.mesh, self.loading, self.bulk, self.comm = mesh, loading, bulk, comm
+        self.rves = (rves,) if isinstance(rves, RVE) else tuple(rves)
+        lattice = np.ones(len(mesh.cells), bool) if is_lattice is None else np.asarray(is_lattice)
+        counts = {rve.mode_count for rve in self.rves}
+        if len(counts) != 1:
+            raise InputError(f"RVEs: expected one or more with as many modes, got {counts}")
+        if lattice.shape != (len(mesh.cells),) or not lattice.any():
+            raise InputError("homogenized body: expected one element or more of lattice, got none")
+        if bulk is None and not lattice.all():
+            raise InputError("homogenized body: expected a material of the bulk, got none")
+        self.mode_count, self.is_lattice = counts.pop(), lattice
+        low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+        self.length = float(length if length is not None else high[0] - low[0])
+        self._number_unknowns()
+        self.regions = [self._region(lattice, points, self.mode_count)]
+        if not lattice.all():
+            self.regions.append(self._region(~lattice, points, 0))
+        self._constrain(low, high)
+        self._find_pattern()
+        self.point_count = self.regions[0].at.weights.size
+        count = self.point_count * len(self.rves)
+        if comm.size > count:
+            raise InputError(f"MPI: expected at most {count} ranks, one an RVE, got {comm.size}")
+        self.own = np.arange(comm.rank, count, comm.size)
+        """Numbers of this rank's RVEs: point times RVEs a point plus which of them."""
+        sizes = [self.rve(k).cell.reduction.size for k in self.own]
+        self.offsets = self.free_count + np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        self._factor: Factor | None = None
+
+    @classmethod
+    def of_specimen(
+        cls,
+        specimen: Specimen,
+        rves: RVE | Sequence[RVE],
+        loading: PlateLoading,
+        bulk: Material | None = None,
+        divisions: tuple[int, int] | None = None,
+        points: int = 2,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+    ) -> HomogenizedBody:
+        """A rectangle of holes with its bulk edges, of the RVEs' material unless given."""
+        mesh, lattice = specimen_mesh(specimen, divisions)
+        solid = bulk or (rves if isinstance(rves, RVE) else rves[0]).material
+        return cls(mesh, rves, loading, specimen.length, solid, lattice, points, comm)
+
+    def rve(self, number: int | np.int64) -> RVE:
+        """The RVE of a number among those of all points."""
+        return self.rves[number % len(self.rves)]
+
+    @property
+    def start(self) -> FloatArray:
+        """The undeformed state: y, then w of this rank's RVEs one after the other."""
+        return np.zeros(self.offsets[-1])
+
+    def fluctuations(self, value: FloatArray) -> list[FloatArray]:
+        """w of this rank's RVEs in a state."""
+        return np.split(value, self.offsets[:-1])[1:]
+
+    def unknowns(self, value: FloatArray, load: float) -> FloatArray:
+        """All unknowns a of a state at a load."""
+        return self.expand(value[: self.free_count]) + load * self.direction
+
+    def displacement(self, unknowns: FloatArray) -> FloatArray:
+        """(n, 2) [mm]."""
+        return unknowns[: 2 * len(self.mesh.nodes)].reshape(-1, 2)
+
+    def amplitudes(self, unknowns: FloatArray) -> FloatArray:
+        """(n, m) v_i at the nodes; NaN where there is no lattice."""
+        values = np.full((len(self.mesh.nodes), self.mode_count), np.nan)
+        values[self._lattice_nodes] = unknowns[2 * len(values) :].reshape(
+            len(self._lattice_nodes), self.mode_count
+        )
+        return values
+
+    def strains(self, unknowns: FloatArray) -> list[FloatArray]:
+        """(points, s) generalised strains, of the lattice and, if there is any, of the bulk."""
+        found = [np.einsum("cpsd,cd->cps", r.B, unknowns[r.dofs]) for r in self.regions]
+        for q in found:
+            q[..., :_FIRST_ORDER] += np.eye(2).ravel()
+        return [q.reshape(-1, q.shape[-1]) for q in found]
+
+    def _number_unknowns(self) -> None:
+        """u of all nodes, then v of those of the lattice."""
+        nodes = np.unique(self.mesh.cells[self.is_lattice])
+        self._lattice_nodes, n, m = nodes, len(self.mesh.nodes), self.mode_count
+        self._u_dofs = np.arange(2 * n).reshape(n, 2)
+        self._v_dofs = np.full((n, m), -1)
+        self._v_dofs[nodes] = 2 * n + np.arange(m * len(nodes)).reshape(len(nodes), m)
+        self.size = 2 * n + m * len(nodes)
+
+    def _region(self, chosen: BoolArray, points: int, m: int) -> _Region:
+        cells = self.mesh.cells[chosen]
+        at = quadrature(Mesh(self.mesh.nodes, cells, self.mesh.element), points)
+        c, p, k, _ = at.gradients.shape
+        B = np.zeros((c, p, _FIRST_ORDER + 3 * m, k, 2 + m))
+        for axis in (0, 1):
+            B[:, :, 2 * axis : 2 * axis + 2, :, axis] = at.gradients.swapaxes(2, 3)
+        for i in range(m):
+            g = _FIRST_ORDER + m + 2 * i
+            B[:, :, _FIRST_ORDER + i, :, 2 + i] = at.shapes
+            B[:, :, g : g + 2, :, 2 + i] = at.gradients.swapaxes(2, 3)
+        dofs = np.concatenate([self._u_dofs[cells], self._v_dofs[cells][..., :m]], axis=2)
+        return _Region(at, B.reshape(c, p, -1, k * (2 + m)), dofs.reshape(c, -1))
+
+    def _constrain(self, low: FloatArray, high: FloatArray) -> None:
+        """Which unknowns are free, which follow another one, and how the load moves the rest."""
+        nodes, loading = self.mesh.nodes, self.loading
+        near = 1e-6 * float((high - low).max())
+        on = [np.abs(nodes - edge) < near for edge in (low, high)]
+        plates, sides = [e[:, 0] for e in on], [e[:, 1] for e in on]
+        held, direction = np.zeros(self.size, bool), np.zeros(self.size)
+        half, middle = 0.5 * (high - low), 0.5 * (high + low)
+        for sign, plate in zip((1.0, -1.0), plates, strict=True):
+            y = (nodes[plate, 1] - middle[1]) / half[1]
+            held[self._u_dofs[plate, 0]] = True
+            push = loading.compression + loading.bending * y
+            direction[self._u_dofs[plate, 0]] = 0.5 * sign * self.length * push
+            if loading.plates == "clamped":
+                held[self._u_dofs[plate, 1]] = True
+                direction[self._u_dofs[plate, 1]] = -0.5 * sign * self.length * loading.shear
+        if loading.plates == "sliding" and loading.sides != "guided":
+            left = np.flatnonzero(plates[0])
+            held[self._u_dofs[left[np.argmin(np.abs(nodes[left, 1] - middle[1]))], 1]] = True
+        if loading.sides == "guided":
+            held[self._u_dofs[sides[0] | sides[1], 1]] = True
+        if loading.pattern_at_plates == "zero":
+            self._hold_pattern(held, plates[0] | plates[1])
+        if loading.pattern_at_bulk == "zero" and not self.is_lattice.all():
+            at_bulk = np.zeros(len(nodes), bool)
+            at_bulk[self.mesh.cells[~self.is_lattice]] = True
+            self._hold_pattern(held, at_bulk)
+        follows = np.arange(self.size)
+        if loading.sides == "periodic":
+            lower, upper = (np.flatnonzero(side) for side in sides)
+            lower, upper = (s[np.argsort(nodes[s, 0])] for s in (lower, upper))
+            x = nodes[lower, 0], nodes[upper, 0]
+            if len(lower) != len(upper) or not np.allclose(*x, rtol=0, atol=near):
+                raise InputError(
+                    "macroscopic mesh: expected nodes alike on both periodic sides, got others"
+                )
+            follows[self._u_dofs[upper]] = self._u_dofs[lower]
+            has_v = self._v_dofs[upper] >= 0
+            follows[self._v_dofs[upper][has_v]] = self._v_dofs[lower][has_v]
+        self._require_support(held, follows)
+        self.direction: FloatArray = direction
+        """(size,) derivatives of all unknowns by the load."""
+        own = np.flatnonzero(~held & (follows == np.arange(self.size)))
+        self.free_count = len(own)
+        numbers = np.full(self.size, -1)
+        numbers[own] = np.arange(len(own))
+        self.place: IntArray = np.where(held, -1, numbers[follows])
+        """(size,) number of the free unknown that each unknown is, -1 where it is prescribed."""
+        self.is_pattern = own >= 2 * len(nodes)
+        """(free_count,) which of y are amplitudes v."""
+
+    def _hold_pattern(self, held: BoolArray, where: BoolArray) -> None:
+        dofs = self._v_dofs[where]
+        held[dofs[dofs >= 0]] = True
+
+    def _require_support(self, held: BoolArray, follows: IntArray) -> None:
+        """No rigid motion may be left."""
+        X, count = self.mesh.nodes, 2 * len(self.mesh.nodes)
+        X = (X - X.mean(axis=0)) / np.ptp(X, axis=0).max()
+        turn = np.stack([-X[:, 1], X[:, 0]], axis=1).ravel()
+        rigid = np.column_stack([np.tile([1.0, 0.0], len(X)), np.tile([0.0, 1.0], len(X)), turn])
+        rows = np.vstack([rigid[held[:count]], rigid[follows[:count]] - rigid])
+        if np.linalg.matrix_rank(rows, 1e-6) < 3:
+            raise InputError(
+                "homogenized body: expected supports that leave no rigid motion, got too few; "
+                "give plates more than one node, clamp them or guide the sides"
+            )
+
+    def _find_pattern(self) -> None:
+        """Where every entry of the elements' matrices goes among those of the stiffness."""
+        rows, columns, kept = [], [], []
+        for region in self.regions:
+            place = self.place[region.dofs]
+            row, column = np.broadcast_arrays(place[:, :, None], place[:, None, :])
+            is_free = (row >= 0) & (column >= 0)
+            kept.append(is_free.ravel())
+            rows.append(row[is_free])
+            columns.append(column[is_free])
+        numbers = np.concatenate(rows) * self.free_count + np.concatenate(columns)
+        entries, self._entry = np.unique(numbers, return_inverse=True)
+        self._kept = np.concatenate(kept)
+        self._indices = entries % self.free_count
+        counts = np.bincount(entries // self.free_count, minlength=self.free_count)
+        self._indptr = np.concatenate([[0], np.cumsum(counts)])
+
+    def expand(self, y: FloatArray) -> FloatArray:
+        """(size,) all unknowns, those of the load 0, from y."""
+        return np.where(self.place >= 0, np.append(y, 0.0)[self.place], 0.0)
+
+    def restrict(self, forces: FloatArray) -> FloatArray:
+        """(free_count,) forces on y of forces on all unknowns."""
+        free = self.place >= 0
+        return np.asarray(np.bincount(self.place[free], forces[free], self.free_count), np.float64)
+
+    def matrix(self, element_matrices: Sequence[FloatArray]) -> csr_array:
+        """The sparse matrix of y from those of the regions' elements (c, d, d)."""
+        values = np.concatenate([K.ravel() for K in element_matrices])[self._kept]
+        data = np.bincount(self._entry, values, len(self._indices))
+        return csr_array((data, self._indices, self._indptr), (self.free_count,) * 2)
+
+    def summed(self, element_forces: Sequence[FloatArray]) -> FloatArray:
+        """(size,) forces on all unknowns from those of the regions' elements (c, d)."""
+        total = np.zeros(self.size)
+        for region, forces in zip(self.regions, element_forces, strict=True):
+            total += np.bincount(region.dofs.ravel(), forces.ravel(), self.size)
+        return total
+
+    def factor(self, matrix: csr_array) -> Factor:
+        """Factorise a stiffness of y, L D L^T; the same object again."""
+        if self._factor is None:
+            self._factor = factorise(matrix, definite=False)
+        else:
+            self._factor.update(matrix)
+        return self._factor
+
+    def bulk_response(self, strains: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Energy density (p,), P (p, 4) and moduli (p, 4, 4) [MPa] of the bulk at F̄ (p, 4)."""
+        F = strains.reshape(-1, 2, 2)
+        P, A = stress_and_tangent(self.bulk, F)
+        assert self.bulk is not None
+        return self.bulk.energy(JetMatrix(F)).value, P.reshape(-1, 4), A.reshape(-1, 4, 4)
+
+    def gathered(self, own: FloatArray) -> FloatArray:
+        """(points, RVEs a point, ...) on all ranks, from this rank's RVEs (l, ...)."""
+        parts = self.comm.allgather(own)
+        every = np.empty((sum(len(p) for p in parts), *own.shape[1:]))
+        for rank, part in enumerate(parts):
+            every[rank :: self.comm.size] = part
+        return every.reshape(self.point_count, len(self.rves), *own.shape[1:])
+
+
+class LinearisedBody:
+    """The equations of both scales at a trial state, the RVEs condensed.
+
+    ``residual`` and ``load_force`` (free_count,) are the forces on y [N/mm], RVEs relaxed, and
+    their derivative by the load; ``forces`` and ``along_load`` (size,) the same on all unknowns,
+    ``load_size`` the norm of the latter; ``stiffness`` is the derivative by y. ``excess`` is the
+    largest imbalance of an RVE over what a unit of F̄ makes there; ``rve_negative`` the number of
+    the RVEs' negative eigenvalues at fixed strains.
+    """
+
+    def __init__(self, body: HomogenizedBody, load: float, value: FloatArray) -> None:
+        self.body, self.load, self.value = body, load, value
+        self.unknowns = body.unknowns(value, load)
+        strains = body.strains(self.unknowns)
+        self.strains = strains[0]
+        self._condense()
+        if not self.is_regular:
+            return
+        stresses, moduli = [self.stresses], [self.moduli]
+        if len(strains) > 1:
+            _, P, A = body.bulk_response(strains[1])
+            stresses, moduli = [*stresses, P], [*moduli, A]
+        forces, matrices, along = [], [], []
+        for region, s, D in zip(body.regions, stresses, moduli, strict=True):
+            c, p, size, _ = region.B.shape
+            weighted = region.at.weights[..., None] * s.reshape(c, p, size)
+            forces.append(np.einsum("cpsd,cps->cd", region.B, weighted))
+            DB = D.reshape(c, p, size, size) @ region.B
+            weighted = region.at.weights[..., None, None] * DB
+            K = (region.B.swapaxes(2, 3) @ weighted).sum(axis=1)
+            matrices.append(K)
+            along.append(np.einsum("cde,ce->cd", K, body.direction[region.dofs]))
+        self.forces = body.summed(forces)
+        self.residual = body.restrict(self.forces)
+        self.along_load = body.summed(along)
+        self.load_force = body.restrict(self.along_load)
+        self.load_size = float(np.linalg.norm(self.along_load))
+        self.stiffness = body.matrix(matrices)
+
+    def _condense(self) -> None:
+        """Condense this rank's RVEs, and exchange what all ranks need of them."""
+        body, count = self.body, 4 + 3 * self.body.mode_count
+        rows = np.full((len(body.own), count * (count + 1) + 2), np.nan)
+        self._relaxed: list[FloatArray] = []
+        self._response: list[FloatArray] = []
+        for row, number, w in zip(rows, body.own, body.fluctuations(self.value), strict=True):
+            rve = body.rve(number)
+            at = rve.condensed(self.strains[number // len(body.rves)], w)
+            if not at.is_regular:
+                break
+            excess = np.linalg.norm(at.forces) / np.linalg.norm(at.on_carriers[:, :_FIRST_ORDER])
+            known = at.relaxed_forces / rve.area, at.condensed.ravel() / rve.area
+            row[:] = np.concatenate([*known, [excess, at.negative]])
+            self._relaxed.append(at.relaxed)
+            self._response.append(at.response)
+        every = body.gathered(rows)
+        self.is_regular = bool(np.isfinite(every).all())
+        if not self.is_regular:
+            return
+        self.excess, self.rve_negative = float(every[..., -2].max()), int(every[..., -1].sum())
+        means = every.mean(axis=1)
+        self.stresses, moduli = means[:, :count], means[:, count:-2]
+        self.moduli = moduli.reshape(-1, count, count)
+
+    def moved(self, dy: FloatArray, change: float, relax: bool = True) -> FloatArray:
+        """Change of the whole state by that of y and of the load; RVEs go into equilibrium too."""
+        body = self.body
+        da = body.expand(dy) + change * body.direction
+        dq = np.einsum("cpsd,cd->cps", body.regions[0].B, da[body.regions[0].dofs])
+        dq = dq.reshape(body.point_count, -1)
+        parts = [dy]
+        for number, relaxed, response in zip(body.own, self._relaxed, self._response, strict=True):
+            follows = response @ dq[number // len(body.rves)]
+            parts.append(relaxed + follows if relax else follows)
+        return np.concatenate(parts)

@@ -1,0 +1,51 @@
+"""Options of homogenization: how a homogenized specimen is held, loaded and divided."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeharvest.fem.experiment import require_edges
+from modeharvest.util.errors import InputError
+
+SIDES = ("free", "periodic", "guided")
+PATTERN = ("zero", "free")
+
+
+@dataclass(frozen=True)
+class PlateLoading:
+    """Two rigid plates at the edges of least and largest x, moved in proportion to the load e.
+
+    At x = +-a they have u_x = -+ e L (compression + bending y / b) / 2 and u_y = +- e L shear / 2
+    with b half the height: e is the nominal strain of ``compression = 1``, the mean shear of
+    ``shear = 1``, and the nominal strain of the uppermost fibre of ``bending = 1`` (small turns).
+    """
+
+    compression: float = 1.0
+    shear: float = 0.0
+    bending: float = 0.0
+    plates: str = "clamped"
+    """With "sliding", u_y is free on the plates but for one node, which keeps the body there."""
+    sides: str = "free"
+    """The edges of least and largest y: "free"; "periodic" with F̄_22 = 1 in the mean: all fields
+    are alike on both; "guided": u_y = 0."""
+    pattern_at_plates: str = "zero"
+    pattern_at_bulk: str = "zero"
+    """Whether v is 0 where the lattice meets a plate, and where it meets solid bulk, or "free":
+    Lambda . n = 0 there."""
+
+    def __post_init__(self) -> None:
+        require_edges(self.plates)
+        rates = self.compression, self.shear, self.bending
+        if not np.isfinite(rates).all() or not any(rates):
+            raise InputError(f"plates: expected finite rates, one of them not 0, got {rates}")
+        if self.shear and self.plates != "clamped":
+            raise InputError("plates: expected clamped ones to shear a specimen, got 'sliding'")
+        if self.sides not in SIDES:
+            raise InputError(f"sides: expected one of {SIDES}, got {self.sides!r}")
+        if self.bending and self.sides == "periodic":
+            raise InputError("sides: expected 'free' or 'guided' ones in bending, got 'periodic'")
+        for name in ("pattern_at_plates", "pattern_at_bulk"):
+            if getattr(self, name) not in PATTERN:
+                raise InputError(f"{name}: expected one of {PATTERN}, got {getattr(self, name)!r}")

@@ -1,0 +1,201 @@
+"""A representative volume element (RVE) with given modes: generalised stresses and moduli.
+
+    u(X) = (F̄ - I) X + sum_i (v_i + g_i . X) phi_i(X) + w(X),    X from the RVE's centre,
+
+with w periodic, <w> = 0, <w . phi_i> = 0, <(w . phi_i) X> = 0 over the material, so that w has
+nothing of what F̄, v and g say. With the energy W(F̄, v, g) per area |Q|, holes included,
+
+    P̄ = dW/dF̄ = <P>,   Pi_i = dW/dv_i = <P : grad phi_i>,
+    Lambda_i = dW/dg_i = <P^T phi_i + X (P : grad phi_i)>   (<.> times the material over |Q|).
+
+Rokos, Ameen, Peerlings & Geers, J. Mech. Phys. Solids 123 (2019) 119-137, doi
+10.1016/j.jmps.2018.08.019. Without modes this is first-order homogenization. Generalised strains
+are q = (F̄_11, F̄_12, F̄_21, F̄_22, v_1 ..., g_1x, g_1y, ...), stresses in the same order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.cell import CondensedCell, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.lattice.micromorphic.patterns import ModeField
+from modeharvest.fem.materials import Material
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.errors import InputError
+
+NORMALISATIONS = ("rms", "largest", "given")
+"""The mean of phi . phi over the material is 1; max |phi| at nodes is 1; phi as it is given."""
+_PERIODIC = 1e-6  # of max |phi|: by how much partner nodes may differ
+_DEPENDENT = 1e-6  # least singular value of normalised modes
+
+
+class RVE:
+    """One RVE, which serves at all points of a continuum: kinematics, stresses, moduli.
+
+    An InputError refuses modes without the cell's period, linearly dependent or zero ones, and
+    cells that don't tile the lattice.
+
+    cell : with the period of the modes, such as ``square(...).enlarged(2, 2)``.
+    modes : fields in the cell's coordinates, or values at its nodes (n, 2). Their means over the
+        material, translations, are taken out.
+    centre : point of the lattice from which X is measured [mm]. The cell is cut anew about it (what
+        is nearer to it than to its copies), and how matters: a junction or a hole's centre.
+    normalisation : of the modes, among ``NORMALISATIONS``; v_i are in mm over it. ``scales`` (m,)
+        are what modes were multiplied by.
+    """
+
+    def __init__(
+        self,
+        cell: UnitCell,
+        material: Material,
+        modes: Sequence[ModeField] = (),
+        centre: ArrayLike = (0.0, 0.0),
+        normalisation: str = "rms",
+    ) -> None:
+        if normalisation not in NORMALISATIONS:
+            known = ", ".join(NORMALISATIONS)
+            raise InputError(f"RVE: expected a normalisation among {known}, got {normalisation!r}")
+        self.centre = np.asarray(centre, dtype=np.float64)
+        about, masters = centred_cell(cell, self.centre)
+        self.cell, self.material = PeriodicCell(about, material), material
+        self.area, self.mode_count = about.area, len(modes)
+        self._mass = self.cell.nodal_mass
+        given = [_at_nodes(mode, k, cell)[masters] for k, mode in enumerate(modes, start=1)]
+        fields = np.array(given, dtype=np.float64).reshape(len(modes), len(masters), 2)
+        shapes, self.scales = self._normalised(fields, normalisation)
+        self.shapes = shapes
+        """(m, n, 2) the modes at the nodes of ``cell``."""
+        X = about.mesh.nodes
+        along = (shapes[:, None] * X.T[None, :, :, None]).reshape(-1, len(X), 2)
+        patterns = np.concatenate([shapes, along]).reshape(3 * len(modes), X.size)
+        self.carriers = np.column_stack([self.cell.affine, patterns.T])
+        """(2 n, 4 + 3 m) nodal displacements [mm] of generalised strains of 1."""
+        self._constraints = self._independent(patterns) if len(modes) else None
+
+    @property
+    def at_rest(self) -> FloatArray:
+        """(4 + 3 m,) generalised strains of the undeformed state."""
+        return np.concatenate([np.eye(2).ravel(), np.zeros(3 * self.mode_count)])
+
+    def displacement(self, strains: FloatArray, fluctuation: FloatArray) -> FloatArray:
+        """(n, 2) of the nodes of ``cell`` [mm], with <w> = 0."""
+        w = self.cell.reduction.displacement(fluctuation)
+        return np.asarray(self._carried(strains) + w - self._mean(w))
+
+    def condensed(self, strains: FloatArray, fluctuation: FloatArray) -> CondensedCell:
+        """The equations at strains q (4 + 3 m,) and w (2 count,) of the masters, w condensed."""
+        violation: FloatArray | float = 0.0
+        if self._constraints is not None:
+            violation = self._constraints @ fluctuation[self.cell.free_dofs]
+        u = self._carried(strains) + self.cell.reduction.displacement(fluctuation)
+        return CondensedCell(self.cell, self.carriers, u, self._constraints, violation)
+
+    def energy(self, strains: FloatArray, fluctuation: FloatArray) -> float:
+        """Stored energy per area of the cell, holes included [MPa]."""
+        return self.cell.body.energy(self.displacement(strains, fluctuation)) / self.area
+
+    def smallest_jacobian(self, strains: FloatArray, fluctuation: FloatArray) -> float:
+        """Smallest det F at the corners and mid-sides of all elements [-]."""
+        return self.cell.body.smallest_jacobian(self.displacement(strains, fluctuation))
+
+    def _carried(self, strains: FloatArray) -> FloatArray:
+        return np.asarray((self.carriers @ (strains - self.at_rest)).reshape(-1, 2))
+
+    def _mean(self, fields: FloatArray) -> FloatArray:
+        """(..., 1, 2) means over the material of nodal vectors (..., n, 2)."""
+        weights = np.asarray(self._mass.sum(axis=0)).reshape(-1, 2)
+        return np.asarray((weights * fields).sum(axis=-2, keepdims=True) / weights.sum(axis=0))
+
+    def _normalised(self, fields: FloatArray, how: str) -> tuple[FloatArray, FloatArray]:
+        """Modes of mean 0 with their scales."""
+        largest = np.linalg.norm(fields, axis=2).max(axis=1, initial=0.0)
+        fields = fields - self._mean(fields)
+        flat, material = (
+            fields.reshape(len(fields), self._mass.shape[0]),
+            0.5 * float(self._mass.sum()),
+        )
+        gram = flat @ (self._mass @ flat.T) / material
+        rms = np.sqrt(np.diag(gram))
+        if not (rms > _DEPENDENT * largest).all():
+            where = int(np.argmin(rms > _DEPENDENT * largest)) + 1
+            raise InputError(f"mode {where}: expected a field that varies, got a constant one")
+        if len(fields) and np.linalg.eigvalsh(gram / np.outer(rms, rms))[0] < _DEPENDENT**2:
+            raise InputError(
+                f"modes: expected linearly independent ones, got {len(fields)} of which one is a "
+                "sum of the others; leave it out"
+            )
+        peak = np.linalg.norm(fields, axis=2).max(axis=1, initial=0.0)
+        scales = {"rms": 1.0 / rms, "largest": 1.0 / peak, "given": np.ones(len(rms))}[how]
+        return scales[:, None, None] * fields, scales
+
+    def _independent(self, patterns: FloatArray) -> FloatArray:
+        """(3 m, free) orthonormal rows C: C w = 0 is what w has to satisfy.
+
+        With weights of mean 0, the same for any translation of w; so <w> = 0 need not be imposed.
+        """
+        fields = patterns.reshape(len(patterns), -1, 2)
+        weights = self._mass @ (fields - self._mean(fields)).reshape(patterns.shape).T
+        rows, size = np.linalg.qr(self.cell.reduction.restricted(weights)[self.cell.free_dofs])
+        diagonal = np.abs(np.diag(size))
+        if not diagonal.min() > _DEPENDENT * diagonal.max():
+            raise InputError(
+                "modes: expected phi_i and phi_i X to be linearly independent on the cell, got "
+                "such that are not; leave modes out or take a larger cell"
+            )
+        return np.ascontiguousarray(rows.T)
+
+
+def centred_cell(cell: UnitCell, centre: FloatArray) -> tuple[UnitCell, IntArray]:
+    """The same lattice cut about a point, which becomes the origin, and each node's original.
+
+    Elements go whole to the copy of the centre that their own centre is nearest to.
+    """
+    mesh, vectors, old = cell.mesh, cell.lattice, cell.periodicity
+    steps = np.array(list(product(range(-3, 4), repeat=2)))
+    middles = mesh.nodes[mesh.cells[:, :3]].mean(axis=1) - centre
+    copies = middles[:, None] + steps @ vectors
+    # Ties are settled alike everywhere: those on a side belong to the right and the upper one.
+    tilt = 1e-7 * np.linalg.norm(vectors, axis=1).max() * np.array([1.0, 0.7])
+    shift = steps[np.argmin(np.linalg.norm(copies + tilt, axis=2), axis=1)]
+    keys = np.concatenate(
+        [old.master[mesh.cells][..., None], old.shift[mesh.cells] + shift[:, None]], axis=2
+    )
+    unique, cells = np.unique(keys.reshape(-1, 3), axis=0, return_inverse=True)
+    first = np.full(old.count, -1)
+    first[old.master[::-1]] = np.arange(len(mesh.nodes))[::-1]
+    originals = first[unique[:, 0]]
+    offset = unique[:, 1:] - old.shift[originals]
+    nodes = mesh.nodes[originals] + offset @ vectors - centre
+    moved = UnitCell(Mesh(nodes, cells.reshape(mesh.cells.shape), mesh.element), vectors)
+    return moved, originals
+
+
+def _at_nodes(mode: ModeField, number: int, cell: UnitCell) -> FloatArray:
+    """(n, 2) values of a mode at the cell's nodes, equal at partners."""
+    nodes = cell.mesh.nodes
+    values = np.asarray(mode(nodes) if callable(mode) else mode, dtype=np.float64)
+    if values.shape != nodes.shape or not np.isfinite(values).all():
+        raise InputError(
+            f"mode {number}: expected finite values {nodes.shape} at the cell's nodes, got "
+            f"{values.shape}"
+        )
+    count = cell.periodicity.count
+    at_masters = np.zeros((count, 2))
+    at_masters[cell.periodicity.master] = values
+    off = np.abs(at_masters[cell.periodicity.master] - values).max()
+    largest = float(np.linalg.norm(values, axis=1).max())
+    if not largest > 0:
+        raise InputError(f"mode {number}: expected a field other than 0")
+    if off > _PERIODIC * largest:
+        raise InputError(
+            f"mode {number}: expected a field with the cell's period, got one that differs by "
+            f"{off / largest:.2g} of its maximum at partner nodes; snap its wave vectors to the "
+            "cell (patterns.snapped) or take a larger cell (enlarged)"
+        )
+    return values
