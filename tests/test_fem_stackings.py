@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import three_modes
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
@@ -133,6 +135,21 @@ def test_three_modes_of_a_triangular_specimen_are_measured(tmp_path: Path) -> No
         part, family = ansatz.phi_slice(i), ansatz.modes[i].family
         found, true = (two_waves_near(b[part], family.start, 1.9) for b in (result.unknowns, a))
         np.testing.assert_allclose(found, true, atol=0.02)
+
+
+@pytest.mark.parametrize("v_degree", [1, 3])
+def test_three_free_modes_of_a_buckled_lattice_are_measured(v_degree: int, tmp_path: Path) -> None:
+    """A specimen cut out of the lattice on the branch of all three modes, as benchmarked."""
+    specimen = Specimen(5, 6, 1.7, 1.9, bulk_x=0.0, bulk_y=0.0, stacking="triangular")
+    (solution,) = three_modes.flowers([specimen], 0.02)
+    (pair,) = make_images(solution, replace(IMAGING, pixel_size=0.03), tmp_path)
+    found = three_modes.measured(pair, specimen, v_degree)
+    assert found.converged
+    assert all(found.is_observable)
+    np.testing.assert_allclose(found.modes_px, np.mean(found.modes_px), rtol=0.01)
+    # What moves a wave by 3 % of its length from one end of the specimen to the other.
+    assert max(found.wave_errors) < 0.01
+    assert found.idic_px < 0.7 * found.w_px
 
 
 def test_modes_at_the_zone_boundary_have_the_lattices_period() -> None:
