@@ -48,6 +48,9 @@ _LEAST_PX, _MOST_PX = 6.0, 400.0
 """Shorter ones leave single nodes to what splines make of edges."""
 _STRONGER = 4.0
 """Weight of the regularisation that shows its bias, over the weight used [-]."""
+_OF_SLOPES = 2.0
+"""Bias of gradients over what that shows: waves that are gone, half of it in a spectrum k^-3.5,
+can't change."""
 _SIGNIFICANT = 3.0
 """Standard deviations."""
 
@@ -119,9 +122,9 @@ class Deviations(NamedTuple):
         """(n, 2) of u [mm]."""
         return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
 
-    def with_bias(self, mesh: Mesh, change: FloatArray) -> Deviations:
-        """Count the mean square around each node of a possible change (n, 2) of u as well [mm]."""
-        slope = nodal_gradient(mesh, change)
+    def with_bias(self, mesh: Mesh, change: FloatArray, of_slopes: float = 1.0) -> Deviations:
+        """Count a possible change (n, 2) of u [mm], rms around nodes; its slope so many times."""
+        slope = of_slopes * nodal_gradient(mesh, change)
         spread = smoothed(mesh, np.einsum("nij,nkl->nijkl", slope, slope))
         return Deviations(
             self.samples,
@@ -162,7 +165,7 @@ def deviations(
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
     error = interpolation_error(mesh, at.u.reshape(-1, 2))
-    return Deviations(found, error, spread).with_bias(mesh, change)
+    return Deviations(found, error, spread).with_bias(mesh, change, _OF_SLOPES)
 
 
 def contradicted(

@@ -1,0 +1,164 @@
+"""How often 95 % intervals of the whole displacement, and of its strains, hold the truth.
+
+A small specimen (3 x 4 holes, d/l 0.79, 13 %, 0.02 mm/px), every seed with a speckle pattern and
+with noise of its own; 8-bit images and such with 1 and 2 % of noise. Over all pixels of the
+material, and within 10 px of its edges: the share of components of u and of the Green-Lagrange
+strain in their intervals, mean and standard deviation over the seeds, the least of any seed; and
+the rms error over the rms standard deviation. Every measurement starts at the best fit of the
+ansatz. The truth's strain is that of its finite elements, a fifth as long as those of the
+measurement, averaged around their nodes.
+
+Run: scripts/env python benchmarks/whole_coverage.py [--seeds 30] [--noise 0 0.01 0.02]
+     [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from cutoff import SPECIMENS
+from numpy.typing import NDArray
+from whole_field import Regions, noisy
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Solution
+from modeharvest.fem.simulate import simulate
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.finite_element.fields import field_of, nodal_gradient
+from modeharvest.idic.finite_element.measure import measure_displacement
+from modeharvest.idic.setup import AnsatzOptions
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.mapping.isoparametric import interpolate, locate
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
+
+FloatArray = NDArray[np.float64]
+
+NAME, PIXEL = "square, d/l 0.79", 0.02
+STRAINS = "xx", "yy", "xy"
+NORMAL_95 = 1.959964
+
+
+@dataclass(frozen=True)
+class Row:
+    """Of one seed, for u and for each strain: over all pixels, and at edges."""
+
+    noise: float
+    seed: int
+    cutoff_px: float
+    held: dict[str, tuple[float, float]]
+    """Shares in 95 % intervals."""
+    error: dict[str, tuple[float, float]]
+    deviation: dict[str, tuple[float, float]]
+    """Rms error and rms standard deviation: of u [px], of strains [-]."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=30)
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 0.01, 0.02])
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    specimen, strain = SPECIMENS[NAME]
+    solution = simulate(Experiment(specimen, strains=(strain,), mesh_size=0.1))
+    rows: list[Row] = []
+    for seed in range(given.seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            spec = ImagingSpec(pixel_size=PIXEL, speckle=SpeckleSpec(seed=seed))
+            make_images(solution, spec, folder)
+            images = ImageSet.read(Path(folder))
+            true = true_strain(solution, images.grid)
+            for noise in given.noise:
+                pair = noisy(images, strain, noise, seed)
+                rows.append(measured(pair, specimen, true, noise, seed))
+                show(rows[-1])
+        if given.json:
+            given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), "utf-8")
+    table(rows)
+
+
+def true_strain(solution: Solution, grid: PixelGrid) -> FloatArray:
+    """(rows, cols, 2, 2) Green-Lagrange strain at the pixels [-]; NaN off the material."""
+    (snapshot,), mesh = solution.snapshots, solution.mesh
+    F = np.eye(2) + nodal_gradient(mesh, snapshot.displacement)
+    located = locate(mesh.nodes, mesh.cells, mesh.element, grid)
+    at = np.moveaxis(interpolate(located, mesh.cells, mesh.element, F.reshape(-1, 4)), 0, -1)
+    E = field_of("green_lagrange", at.reshape(-1, 2, 2))
+    return np.asarray(E.reshape(*grid.shape, 2, 2))
+
+
+def measured(pair: ImagePair, specimen: Specimen, true: FloatArray, noise: float, seed: int) -> Row:
+    """Measure, and set u and strains against the truth."""
+    assert pair.truth is not None
+    ansatz = Ansatz.of_specimen(specimen, options=AnsatzOptions(4, 3))
+    guess = ansatz.initial_guess(pair.strain)
+    start = fit_displacement(pair.truth.displacement, pair.grid, ansatz, guess, pair.mask)
+    found, grid, px = measure_displacement(pair, start), pair.grid, pair.grid.pixel_size
+    places = Regions.of(pair, specimen)
+    both = places.all & np.isfinite(true[..., 0, 0]), places.edges & np.isfinite(true[..., 0, 0])
+    errors = {"u": (found.displacement_on() - pair.truth.displacement) / px}
+    bars = {"u": found.standard_deviation_on() / px}
+    E, sd = found.field("green_lagrange", grid), found.field_deviation("green_lagrange", grid)
+    for name in STRAINS:
+        i, j = map("xy".index, name)
+        errors[name], bars[name] = (E - true)[..., i, j], sd[..., i, j]
+
+    def of(name: str, there: NDArray[np.bool_]) -> tuple[float, float, float]:
+        e, s = errors[name][there], bars[name][there]
+        held = float(np.mean(np.abs(e) < NORMAL_95 * s))
+        return held, float(np.sqrt(np.mean(e**2))), float(np.sqrt(np.mean(s**2)))
+
+    each = {name: [*zip(*map(partial(of, name), both), strict=True)] for name in errors}
+    parts = ({name: values[k] for name, values in each.items()} for k in range(3))
+    return Row(noise, seed, found.cutoff_px, *parts)  # type: ignore[arg-type]
+
+
+def show(row: Row) -> None:
+    """Print a line."""
+    each = "  ".join(
+        f"{name}: {row.held[name][0]:.3f} {row.held[name][1]:.3f} "
+        f"({row.error[name][0] / row.deviation[name][0]:.2f} "
+        f"{row.error[name][1] / row.deviation[name][1]:.2f})"
+        for name in row.held
+    )
+    print(f"{row.noise:5.3f} {row.seed:3d} {row.cutoff_px:5.1f} px  {each}", flush=True)
+
+
+def table(rows: list[Row]) -> None:
+    """Print the document's table."""
+    print(
+        "| images | of | rms error, all / edges | rms bar | 95 % intervals hold, all | at edges |"
+    )
+    print("|---" * 6 + "|")
+    for noise in sorted({row.noise for row in rows}):
+        own = [row for row in rows if row.noise == noise]
+        for name in own[0].held:
+            held = np.array([row.held[name] for row in own])
+            error, bar = (
+                np.sqrt(np.mean(np.square([getattr(row, what)[name] for row in own]), axis=0))
+                for what in ("error", "deviation")
+            )
+            unit, scale = (" px", 1.0) if name == "u" else (" ‰", 1e3)
+            sd = held.std(axis=0, ddof=min(1, len(own) - 1))
+            shares = [
+                f"{100 * m:.1f} ± {100 * s:.1f} % (≥ {100 * least:.1f} %)"
+                for m, s, least in zip(held.mean(axis=0), sd, held.min(axis=0), strict=True)
+            ]
+            sizes = (" / ".join(f"{scale * v:.3g}" for v in pair) for pair in (error, bar))
+            cells = [f"{100 * noise:g} %" if noise else "8 bit", name,
+                     *(text + unit for text in sizes), *shares]  # fmt: skip
+            print(f"| {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
