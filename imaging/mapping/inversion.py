@@ -203,7 +203,7 @@ _CLOSE_PX = 1e-6  # rows that miss a side or a corner by less meet it; pixels ar
 _CLOSE = 1e-6  # the same along a side
 
 
-@compiled(relaxed=True)
+@compiled(inline=True, relaxed=True)
 def ends(sides: FloatArray, corners: FloatArray, row: float) -> tuple[End, End]:
     """Where a row (relative to the centre [px]) first and last meets the element's sides.
 
@@ -249,7 +249,7 @@ def _roots(a: float, b: float, c: float) -> tuple[float, float]:
     return q / a, c / q
 
 
-@compiled(relaxed=True)
+@compiled(inline=True, relaxed=True)
 def start_cubic(
     polynomial: FloatArray,
     curved: bool,

@@ -140,7 +140,7 @@ def _mark_background(
     return overlapping
 
 
-@compiled()
+@compiled(inline=True)
 def _fill_element(
     elements: ElementTable,
     fields: FloatArray,
@@ -187,7 +187,7 @@ def _fill_element(
     _assign(elements, fields, pixels, e, state, begin, batch, count)
 
 
-@compiled()
+@compiled(inline=True)
 def _assign(
     elements: ElementTable,
     fields: FloatArray,
@@ -235,7 +235,7 @@ def _assign(
     _write(fields, pixels.values, e, triangular, where, s, t, assigned)
 
 
-@compiled(relaxed=True)
+@compiled(inline=True, relaxed=True)
 def _check(
     elements: ElementTable,
     pixels: Pixels,
@@ -266,7 +266,7 @@ def _check(
         residual[k] = distance_px(x, y, curved, s[k], t[k], at)
 
 
-@compiled(relaxed=True)
+@compiled(inline=True, relaxed=True)
 def _write(
     fields: FloatArray,
     values: FloatArray,
