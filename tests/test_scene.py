@@ -41,6 +41,15 @@ def moved(
     return image + noise * np.random.default_rng(0).normal(size=SHAPE)
 
 
+def test_blocks_are_stretched_as_their_surroundings_are_expected_to_be() -> None:
+    """To twice their size: where they are not, none is found."""
+    twice = moved((0.0, 0.0), 2.0)
+    match = matched(SPECKLE.image(), twice, expected=lambda points: 2.0 * points)
+    off = np.abs(match.after - 2.0 * match.before).max(axis=1)
+    assert match.share > 0.9
+    assert (off[match.found] <= 1.0).mean() > 0.95
+
+
 @pytest.mark.parametrize("shift", [(0, 0), (7, -3), (-20, 15)])
 def test_a_shifted_surface_is_found_to_the_pixel(shift: tuple[int, int]) -> None:
     match = matched(SPECKLE.image(), moved(shift))

@@ -158,6 +158,8 @@ _SAME = 0.5
 """Share of blocks that must be found."""
 _CLEAR = 0.1
 """By how much a correlation must exceed what chance gives."""
+_LEAST_AREA = 0.1
+"""Of a block over that in the reference; if it is expected smaller, what is expected is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,8 +227,11 @@ def match_blocks(
             "that do; the motion is too large, or the mask is of another image"
         )
     elsewhere = np.roll(aims, len(aims) // 2, axis=0)
-    there = [_search(f, g, c, a, half, reach_px) for c, a in zip(centres, aims, strict=True)]
-    decoys = [_search(f, g, c, a, half, reach_px) for c, a in zip(centres, elsewhere, strict=True)]
+    blocks = _turned(f, centres, half, _gradient(expected, centres, half))
+    there, decoys = (
+        [_search(g, block, aim, reach_px) for block, aim in zip(blocks, at, strict=True)]
+        for at in (aims, elsewhere)
+    )
     return BlockMatch(
         before=centres.astype(np.float64),
         after=np.array([place for place, _ in there], dtype=np.float64),
@@ -301,29 +306,34 @@ def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
 
 
 def _search(
-    f: FloatImage,
-    g: FloatImage,
-    centre: NDArray[np.int64],
-    aim: NDArray[np.int64],
-    half: int,
-    reach: int,
+    g: FloatImage, block: FloatImage, aim: NDArray[np.int64], reach: int
 ) -> tuple[NDArray[np.int64], float]:
-    """Where around ``aim`` the block around ``centre``, turned or not, fits best; how well."""
+    """Where around ``aim`` a block (turns, edge, edge) fits best, turned or not; how well."""
+    half = block.shape[-1] // 2
     low = np.maximum(aim - half - reach, 0)
     high = np.minimum(aim + half + reach + 1, g.shape)
     window = g[low[0] : high[0], low[1] : high[1]]
-    correlation = _correlation(window, _turned(f, centre, half))
+    correlation = _correlation(window, block)
     best = np.array(np.unravel_index(int(np.argmax(correlation)), correlation.shape)[1:])
     value = float(correlation.max())
     return (low + half + best, value) if value > 0.0 else (aim, 0.0)
 
 
-def _turned(f: FloatImage, centre: NDArray[np.int64], half: int) -> FloatImage:
-    """(turns, edge, edge) the block around a pixel, turned by each of ``TURNS_DEG``."""
-    row, col = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
-    angle = np.radians(TURNS_DEG)[:, None, None]
-    c, s = np.cos(angle), np.sin(angle)
-    at = np.array([centre[0] + c * row - s * col, centre[1] + s * row + c * col])
+def _gradient(expected: Expected, centres: NDArray[np.int64], half: int) -> FloatArray:
+    """(n, 2, 2) how the surroundings of centres (n, 2) are stretched where they are expected."""
+    sides = [(expected(centres + d) - expected(centres - d)) / 2.0 for d in np.eye(2) * 2 * half]
+    F = np.stack(sides, axis=-1) / (2 * half)
+    return np.where(np.linalg.det(F)[:, None, None] < _LEAST_AREA, np.eye(2), F)
+
+
+def _turned(
+    f: FloatImage, centres: NDArray[np.int64], half: int, gradient: FloatArray
+) -> FloatImage:
+    """(n, turns, edge, edge) blocks around pixels (n, 2), stretched, turned by ``TURNS_DEG``."""
+    offsets = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
+    c, s = np.cos(np.radians(TURNS_DEG)), np.sin(np.radians(TURNS_DEG))
+    back = np.linalg.inv(gradient)[:, None] @ np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
+    at = np.einsum("ntij,jrc->intrc", back, offsets) + centres.T[:, :, None, None, None]
     return np.asarray(map_coordinates(f, at, order=1, mode="nearest"), dtype=np.float32)
 
 
