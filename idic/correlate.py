@@ -51,6 +51,8 @@ from modeharvest.util.scaled_eigen import ScaledEigen
 
 WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
 """Outcomes with nothing to assess."""
+ASTRAY = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
+"""Outcomes that are neither a result nor a start."""
 _FINEST_PX = 4.0
 """Finer speckle is aliased by the pixels; a filter keeps that out of what weighs the residual."""
 
@@ -107,6 +109,24 @@ def correlate(
     progress(course.count, course.count, "correlate")
     history = (*history, *reached.found.history, *reweighted)
     return replace(result, final_smoothing=smoothing, history=history)
+
+
+def refitted_result(
+    pair: ImagePair, ansatz: Ansatz, unknowns: FloatArray, options: CorrelationOptions
+) -> Result:
+    """Make a result of unknowns (n,) that a correlation would not keep: what the images say there.
+
+    Unknown gain and offset give both images one mean and one contrast.
+    """
+    a = _with_gain_and_offset(ansatz, unknowns, pair)
+    size_px = speckle_size(pair.reference, pair.mask)
+    level = level_pair(pair, FULL, options.edge_px, options.order or spline_order(size_px))
+    search = LevelSearch(level, ansatz, FULL, True, options.gauss_newton, lambda number: None)
+    used = search.valid_assembly(a)
+    there = search.equations(used, a, True)
+    found = Minimum(a, there, Outcome.REFITTED, (), there.matrix)
+    result = _result(_Reached(search, found, used, a), found, size_px)
+    return replace(result, outcome=found.outcome)
 
 
 def best_fit(
@@ -327,8 +347,7 @@ def _assessed(
     result = _result(reached, reached.found, size_px)
     weighting = _weighting(result, size_px, course.options)
     search, used, found = reached.search, reached.used, reached.found
-    without = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
-    if search.level != FULL or result.outcome in without or weighting.is_least_squares:
+    if search.level != FULL or result.outcome in ASTRAY or weighting.is_least_squares:
         return result, ()
     weights = instrument(weighting, pair, search.pair, used, found.unknowns)
     found, how = search.reweighed(found, used, weights)

@@ -234,12 +234,20 @@ class Result:
         bands = self.warped_back(SplineImage.of(pair.deformed, order))
         return np.asarray(pair.reference - np.vstack(list(bands)))
 
-    def warped_back(self, deformed: SplineImage) -> Iterator[FloatArray]:
-        """(1 + b) g(x + u) + c in the reference frame, some rows at a time; NaN off the image."""
+    def warped_back(
+        self, deformed: SplineImage, known: FloatArray | None = None
+    ) -> Iterator[FloatArray]:
+        """(1 + b) g(x + u) + c in the reference frame, some rows at a time; NaN off the image.
+
+        ``known``: (rows, cols, 2) u [mm], NaN where it isn't, instead of the ansatz' own.
+        """
         grid, row, col = self.grid, np.arange(self.grid.rows)[:, None], np.arange(self.grid.cols)
         for first in range(0, grid.rows, _BAND):
             band = slice(first, first + _BAND)
-            u = self.ansatz.displacement(self.unknowns, grid.x, grid.y[band]) / grid.pixel_size
+            if known is None:
+                u = self.ansatz.displacement(self.unknowns, grid.x, grid.y[band]) / grid.pixel_size
+            else:
+                u = np.nan_to_num(known[band] / grid.pixel_size, nan=1e6)  # off any image
             value, _, _ = deformed.sample(row[band] - u[..., 1], col + u[..., 0])
             gain, offset = self.ansatz.gain_and_offset(self.unknowns, grid.x, grid.y[band])
             yield gain * value + offset

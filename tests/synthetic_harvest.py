@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,9 @@ def frame(name: str, strain: float, amplitude: float, fixed: bool = False) -> Ha
         by_model_error=field_errors(result, x, y, leftover),
         spectrum=spectrum,
         pattern=read_pattern(spectrum),
-        local=replace(local, u=noisy, sd=np.full(noisy.shape, 1e-4)),
+        w=replace(local, u=noisy, sd=np.full(noisy.shape, 1e-4)).less(
+            partial(kinematics.displacement_at, a)
+        ),
         start_text=("v0 starts from the local DIC.",),
     )
 

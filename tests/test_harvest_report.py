@@ -76,7 +76,7 @@ def states(harvest: Harvest) -> list[PhotographState]:
 def bare(harvest: Harvest) -> Harvest:
     """One photograph of which only the correlation is known."""
     frame = replace(harvest.frames[1], mask=None, by_model_error=None, spectrum=None, pattern=None,
-                    local=None, start_text=())  # fmt: skip
+                    w=None, start_text=())  # fmt: skip
     return replace(harvest, geometry=replace(harvest.geometry, lattice=None), frames=(frame,),
                    skipped=(), timeline=(), buckling=None, optics=Optics(), full_scale=None,
                    text=(), truth=None, versions={})  # fmt: skip

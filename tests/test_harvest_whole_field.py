@@ -17,15 +17,17 @@ from test_cli import called, error_line
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.finite_element.files import read_result
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.modes import square_family
+from modeharvest.idic.photograph.measure import measure_whole
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
-from modeharvest.runs.photographs.whole_field import PhotographWholeFields, whole_checks
+from modeharvest.runs.twin import whole_checks
 from modeharvest.util.errors import InputError
 from modeharvest.validation.whole_field import WholeField, compare_whole, v_percent, waves_percent
 
@@ -94,8 +96,7 @@ def test_what_the_ansatz_cannot_describe_is_measured(
     if formulation == "updated":
         folder, text = tmp_path, "[whole_field]\nmeasure = true\n"
         run = HarvestRun(PhotographCase.read(experiment(photographs, text, formulation)), folder)
-        assert run.whole_fields is not None
-        assert list(run.whole_fields.found) == list(STATES)
+        assert [name for name, found in run.results().items() if found.whole] == list(STATES)
     for name, strain in STATES.items():
         measured = read_result(folder / "whole_field" / f"{name}.h5")
         error = measured.displacement_on() - truth(strain)(SCENE.points)
@@ -118,6 +119,9 @@ def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) 
     assert last["w_rms_px"] < last["w_max_px"]
     assert last["coverage"] > 0.999
     assert last["start"] == "the result of its correlation"
+    local = found["frames"][-1]["local"]
+    assert local["source"] == "the whole displacement"
+    assert local["w_rms_px"] == pytest.approx(last["w_rms_px"], rel=0.05)
     (mode,) = last["modes"]
     assert [p["name"] for p in mode["parameters"]] == list(square_family("junction").names)
     refit = Result.read(harvested / "whole_field" / "frame_2_refit.json")
@@ -132,7 +136,10 @@ def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) 
     correlated = Result.read(harvested / "results" / "frame_2.json")
     assert apart < 0.3 * rms_px(correlated.displacement() - best.displacement(), SCENE.mask)
     page = (harvested / "report.html").read_text("utf-8")
-    for words in ("Microfluctuation field, measured", "Principal strain", "Modes by both ways"):
+    for words in (
+        "Microfluctuation field, measured", "Principal strain", "Modes by both ways",
+        "Spectral density along x, w",
+    ):  # fmt: skip
         assert words in page
 
 
@@ -172,33 +179,61 @@ def test_again_repeats_nothing(photographs: Path, harvested: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in harvested.glob("whole_field/*")}
     text = "[whole_field]\nmeasure = true\n"
     run = HarvestRun(PhotographCase.read(experiment(photographs, text)), harvested)
-    assert run.whole_fields is not None
-    assert len(run.whole_fields.found) == 2
+    assert [bool(found.whole) for found in run.results().values()] == [True, True]
     assert {p: p.stat().st_mtime_ns for p in harvested.glob("whole_field/*")} == before
 
 
-def test_without_a_correlation_the_images_are_the_start(
-    photographs: Path, harvested: Path, tmp_path: Path
-) -> None:
-    """From the first photograph's displacement, too."""
+def test_a_correlation_that_went_astray_is_done_again(photographs: Path, harvested: Path) -> None:
+    """From the whole displacement, which then starts from the images alone."""
     case = PhotographCase.read(experiment(photographs, "[whole_field]\nmeasure = true\n"))
-    results = dict(HarvestRun(case, harvested).results())
-    astray = results["frame_2"].result
-    lost = replace(astray, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.0 * astray.unknowns)
-    results["frame_2"] = replace(results["frame_2"], result=lost)
-    stages = PhotographWholeFields(
-        case, tmp_path, prepared=HarvestRun(case, harvested).prepared,
-        results=results, keys=dict.fromkeys(results, ""),
+    run = HarvestRun(case, harvested)
+    first, true = run.results()["frame_2"], truth(STATES["frame_2"])(SCENE.points)
+    right, on_mesh = first.result, FiniteElementOptions(edge_px=2)
+    lost = replace(right, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.0 * right.unknowns)
+    still = replace(first.local, u=0.0 * first.local.u)
+    found = measure_whole(
+        run.prepared.pair("frame_2"), run.geometry, PITCH, case.correlation,
+        replace(first, result=lost, local=still),
+        on_mesh.body(run.geometry.mask, SCENE.grid), on_mesh, run.prepared.noise,
     )  # fmt: skip
-    found = stages.found["frame_2"]
-    assert found.start == "blocks of the speckle and the photograph before"
-    error = found.measured.displacement_on() - truth(STATES["frame_2"])(SCENE.points)
+    assert found.whole is not None
+    assert found.whole.start == "blocks of the speckle"
+    error = found.whole.measured.displacement_on() - true
     assert rms_px(error, SCENE.mask & np.isfinite(error[..., 0])) < 0.12
+    assert found.result.outcome is Outcome.CONVERGED
+    assert rms_px(found.result.displacement() - right.displacement(), SCENE.mask) < 0.01
+    assert "started from the ansatz fitted to the whole displacement" in found.text[-2]
+
+
+def test_where_every_correlation_is_trapped_the_refitted_ansatz_is_the_result(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trapped(*given: Any, **named: Any) -> Result:
+        right = correlate(*given, **named)
+        return replace(right, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.9 * right.unknowns)
+
+    monkeypatch.setattr("modeharvest.idic.photograph.measure.correlate", trapped)
+    found = harvest(experiment(photographs), tmp_path, whole_field=True)
+    for frame in found["frames"]:
+        name = frame["name"]
+        assert frame["outcome"] == "refitted"
+        assert frame["whole_field"]["start"] == "blocks of the speckle"
+        assert any("the result is the ansatz refitted" in text for text in frame["warnings"])
+        assert frame["errors_px"]["model_error"] is None
+        assert frame["errors_px"]["noise"]["displacement"] < 0.02
+        result = Result.read(tmp_path / "results" / f"{name}.json")
+        refit = Result.read(tmp_path / "whole_field" / f"{name}_refit.json")
+        assert rms_px(result.displacement() - refit.displacement(), SCENE.mask) < 1e-6
+        true = truth(STATES[name])(SCENE.points)
+        best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
+        # As after a correlation that isn't trapped.
+        assert rms_px(result.displacement() - best.displacement(), SCENE.mask) < 0.02
+        # w makes the residual what it is: 0.8 px beside speckles of 12 px.
+        assert 0.5 < frame["model_error_px"] / (STATES[name] / 0.05 * W_PX / np.sqrt(2.0)) < 1.5
 
 
 def test_it_is_left_out_unless_asked_for(photographs: Path, tmp_path: Path) -> None:
     run = HarvestRun(PhotographCase.read(experiment(photographs)), tmp_path)
-    assert run.whole_fields is None
     assert run.harvest().frames[0].whole is None
 
 

@@ -234,7 +234,7 @@ def test_start_follows_what_no_polynomial_does() -> None:
     before = inverted(wave, at, 1e-9)
     pair = ImagePair(*(pattern(x[..., 0], x[..., 1]) for x in (at, before)), grid)
     mesh = mesh_of_mask(pair.masks[0], grid, 24.0, 24.0).mesh
-    start = block_motion(pair, mesh, None, ("f", "g"))
+    start = block_motion(pair, mesh, 0.0 * mesh.nodes)
     off = np.linalg.norm(start - wave(mesh.nodes), axis=1) / grid.pixel_size
     inner = (abs(mesh.nodes) < 1.2).all(axis=1)  # where there are blocks on all sides
     # Whole pixels, and a block of 41 px is blind to a tenth of such a wave's 8 px.

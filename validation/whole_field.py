@@ -1,4 +1,4 @@
-"""The whole displacement: the ansatz refitted to it, and its errors against the truth."""
+"""The whole displacement: its numbers beside a correlation's, its errors against the truth."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, mode_equivalent
 from modeharvest.util.arrays import BoolArray, FloatArray
@@ -49,25 +48,6 @@ class WholeFieldSummary:
     warnings: tuple[str, ...]
     seconds: float
     """Of the measurement, on this machine."""
-
-
-@dataclass(frozen=True, eq=False)
-class WholeField:
-    """A whole displacement, and the ansatz of a correlation refitted to it."""
-
-    measured: NodalResult
-    refit: Result
-    seconds: float
-    """What the measurement took."""
-    start: str = ""
-    """Where the measurement began, in words."""
-
-
-def refitted(measured: NodalResult, correlated: Result, mask: BoolArray) -> Result:
-    """The ansatz of a correlation, fitted to what was measured on the pixels of a mask."""
-    u, grid = measured.displacement_on(correlated.grid), correlated.grid
-    there = mask & np.isfinite(u[..., 0])
-    return fit_displacement(u, grid, correlated.ansatz, correlated.unknowns, there)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,19 +12,23 @@ from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.cutoff import Risk
 from modeharvest.idic.finite_element.fields import deviation_of, field_of, nodal_gradient
+from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 
 _BEYOND_PX = 2.0
 """How far beyond the mesh's edge its fields are continued: the edge is known to half a pixel."""
 _CHUNK = 500_000
+WHOLE = "the whole displacement"
 Where = PixelGrid | FloatArray | None
 """Pixels, points (k, 2) [mm], or the nodes."""
 
@@ -120,6 +124,16 @@ class NodalResult:
         """(rows, cols, 2) standard deviation of u at pixels [mm]."""
         return self.deviation_at(self.standard_deviation, grid or self.grid)
 
+    def at_points(self, spacing: float) -> LocalField:
+        """u and its standard deviation as a local DIC would give them, about so far apart [mm]."""
+        every = max(1, int(spacing / self.grid.pixel_size))
+        x, y = np.meshgrid(self.grid.x[every // 2 :: every], self.grid.y[every // 2 :: every])
+        points = np.column_stack([x.ravel(), y.ravel()])
+        u = self.at(points)
+        sd, there = self.deviation_at(self.standard_deviation, points), np.isfinite(u[:, 0])
+        x, y = points[there].T
+        return LocalField(x, y, u[there], sd=sd[there], source=WHOLE)
+
     def field(self, name: str, where: Where = None, material: Material | None = None) -> FloatArray:
         """One of ``fields.FIELDS``: strains, and with a material stresses.
 
@@ -167,6 +181,24 @@ class NodalResult:
     def deformation_gradient(self) -> FloatArray:
         """(n, 2, 2) F = I + du/dX at the nodes, the mean of the elements around each [-]."""
         return np.eye(2) + nodal_gradient(self.mesh, self.displacement)
+
+
+@dataclass(frozen=True, eq=False)
+class WholeField:
+    """A whole displacement, and the ansatz of a correlation refitted to it."""
+
+    measured: NodalResult
+    refit: Result
+    seconds: float = float("nan")
+    """What the measurement took."""
+    start: str = ""
+    """Where the measurement began, in words."""
+
+
+def refitted(measured: NodalResult, ansatz: Ansatz, guess: FloatArray, mask: BoolArray) -> Result:
+    """An ansatz, fitted to what was measured on the pixels of a mask; ``guess``: (n,) unknowns."""
+    u = measured.displacement_on()
+    return fit_displacement(u, measured.grid, ansatz, guess, mask & np.isfinite(u[..., 0]))
 
 
 def _continue(

@@ -6,6 +6,7 @@ reference a first measurement gives that of the deformed image.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -116,15 +117,14 @@ def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, 
 
 
 def block_motion(
-    pair: ImagePair, mesh: Mesh, before: NodalResult | None, names: tuple[str, str]
+    pair: ImagePair, mesh: Mesh, known: FloatArray, names: Sequence[str] = ()
 ) -> FloatArray:
-    """(n, 2) displacement of the nodes [mm] to some pixels: the last one, and what blocks moved.
+    """(n, 2) displacement of the nodes [mm] to some pixels: what is known, and what blocks moved.
 
-    A polynomial is fitted to what blocks of the speckle have moved since the image before; where
-    that isn't close to them, a spline through more of them takes its place. InputError if they
-    aren't found.
+    A polynomial is fitted to what blocks of the speckle have moved beyond a known displacement
+    (n, 2); where that isn't close to them, a spline through more of them takes its place.
+    InputError if they aren't found.
     """
-    known = np.zeros_like(mesh.nodes) if before is None else before.displacement
     match = _matched(pair, mesh, known, REACH_PX)
     if match.share < _ENOUGH:
         match = _matched(pair, mesh, known, _FAR_PX)
@@ -213,12 +213,18 @@ def residual(pair: ImagePair, u: FloatArray) -> FloatArray:
     return found
 
 
-def is_misfit(result: NodalResult, noise: float, reference: FloatImage) -> bool:
-    """Whether images don't match somewhere: the residual is more than noise and than slight.
+def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple[str, ...]:
+    """A warning if images don't match somewhere: the residual is more than noise and than slight.
 
     ``noise``: of the residual, rms; ``reference``: (p,) pixels of its material [grey levels].
     """
-    return result.residual_rms > max(_MISFIT * noise, _SLIGHT * float(reference.std()))
+    if result.residual_rms <= max(_MISFIT * noise, _SLIGHT * float(reference.std())):
+        return ()
+    return (
+        f"The residual of the whole displacement is {result.residual_rms:.3g} grey levels, of "
+        f"which noise is about {noise:.2g}: somewhere the images don't match, see its map; give "
+        "images in between, or a mask without what is not material.",
+    )
 
 
 def _compared(

@@ -16,8 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.correlate import correlate
+from modeharvest.idic.correlate import ASTRAY, correlate, refitted_result
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.finite_element.result import WholeField, refitted
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.motion import first_motion
+from modeharvest.idic.photograph.displacement import block_motion, displacement_from, misfit_of
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
@@ -48,6 +53,14 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.progress import Progress, silent
+
+_POINTS_A_CELL = 24
+"""Along a cell, of the whole displacement's values that spectra are taken of."""
+_REFITTED = (
+    "From the best start there is the correlation ended in a local minimum: the result is the "
+    "ansatz refitted to the whole displacement, with the standard deviations by noise that a "
+    "correlation would have."
+)
 
 
 def image_noise(pair: ImagePair, camera: CameraNoise) -> ImageNoise:
@@ -96,8 +109,11 @@ class MeasuredPhotograph:
 
     result: Result
     local: LocalField
-    """The displacement field behind the initial guess, a local DIC's if there is one."""
+    """The displacement field whose spectra chose the modes, a local DIC's if there is one."""
     text: tuple[str, ...]
+    whole: WholeField | None = None
+    """The whole displacement, if it was measured: then ``local`` is taken from it."""
+    warnings: tuple[str, ...] = ()
 
 
 def measure(
@@ -148,6 +164,69 @@ def measure(
     return MeasuredPhotograph(found, guess.local, (*text, found.final_smoothing.text))
 
 
+def measure_whole(
+    pair: ImagePair,
+    geometry: Geometry,
+    cell_size: float,
+    how: PhotographOptions,
+    first: MeasuredPhotograph,
+    body: Body,
+    on_mesh: FiniteElementOptions,
+    camera: CameraNoise,
+    progress: Progress = silent,
+) -> MeasuredPhotograph:
+    """Measure the whole displacement of a photograph that was correlated, and the modes in it.
+
+    The measurement starts from the correlation, or from blocks of the speckle where that ended
+    astray. If its spectra show other waves than the correlation has, or that isn't converged, the
+    ansatz fitted to it starts another; if that ends astray, too, the fit itself is the result.
+
+    ``body``, ``on_mesh``: the mesh of the material, and how to measure on it. The rest, and
+    InputErrors, as for :func:`measure` and ``displacement_from``.
+    """
+    mesh, found, mask = body.mesh, first.result, geometry.mask
+    if found.outcome not in ASTRAY:
+        start, known, a = "the result of its correlation", found.ansatz, found.unknowns
+        gain, offset = known.gain_and_offset(a, pair.grid.x, pair.grid.y)
+        lit = replace(pair, reference=((pair.reference - offset) / gain).astype(np.float32))
+        begin = known.displacement_at(a, mesh.nodes)
+    else:
+        start, lit = "blocks of the speckle", pair
+        slow, _ = first_motion(geometry.region.domain, pair, first.local)
+        begin = block_motion(pair, mesh, slow(mesh.nodes))
+    measured = displacement_from(begin, lit, body, on_mesh, progress)
+    noise = image_noise(pair, camera)
+    expected = float(np.hypot(noise.reference, noise.deformed))
+    misfit = misfit_of(measured, expected, pair.reference[pair.masks[0]])
+    warnings = (*first.warnings, *measured.warnings, *misfit)
+    guess = initial_guess(
+        pair, cell_size, list(geometry.parts.values()),
+        local=measured.at_points(cell_size / _POINTS_A_CELL), lattice=geometry.lattice_mm,
+        domain=geometry.region.domain, options=how,
+    )  # fmt: skip
+    ansatz, unknowns = chosen_modes(guess, geometry, cell_size, how)
+    if _goes_on(found, ansatz, unknowns):
+        refit = refitted(measured, found.ansatz, found.unknowns, mask)
+        text = (*first.text, "The spectra of the whole displacement show no other waves.")
+    else:
+        refit = refitted(measured, ansatz, unknowns, mask)
+        unknowns[: refit.unknowns.size] = refit.unknowns
+        found = correlate(pair, ansatz, guess=unknowns, options=how.options(), progress=progress)
+        assert found.final_smoothing is not None  # as asked for by how.options()
+        text = (
+            first.text[0],
+            *_guess_text(guess, ansatz, geometry),
+            f"A first correlation, of other modes, ended as “{first.result.outcome.value}”; this "
+            "one started from the ansatz fitted to the whole displacement.",
+            found.final_smoothing.text,
+        )
+        if found.outcome in ASTRAY:
+            found = refitted_result(pair, ansatz, unknowns, how.options())
+            warnings = (*warnings, _REFITTED)
+    whole = WholeField(measured, refit, start=start)
+    return MeasuredPhotograph(found, guess.local, text, whole, warnings)
+
+
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
     """Ansatz and unknowns of a result with the specified brightness, as an initial guess."""
     ansatz = replace(result.ansatz, brightness=how.brightness)
@@ -187,15 +266,16 @@ def _moved_holes(result: Result, geometry: Geometry) -> LocalField | None:
 
 
 def warped_back(
-    deformed: NDArray[Any], result: Result, order: int = 5
+    deformed: NDArray[Any], result: Result, order: int = 5, u: FloatArray | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Show a deformed image g (rows, cols) in the frame of the reference.
 
-    (1 + b) g(x + u) + c [grey levels] with a result's displacement, and gain and offset if they
-    were unknowns; and where x + u lies inside the image. The spline's order is 3 or 5.
+    (1 + b) g(x + u) + c [grey levels] with a result's displacement, or one that is given, (rows,
+    cols, 2) [mm], and gain and offset if they were unknowns; and where x + u is known and lies
+    inside the image. The spline's order is 3 or 5.
     """
     spline = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
-    image = np.vstack([np.float32(band) for band in result.warped_back(spline)])
+    image = np.vstack([np.float32(band) for band in result.warped_back(spline, u)])
     inside = np.isfinite(image)
     image[~inside] = 0.0
     return image, inside

@@ -35,6 +35,7 @@ class Outcome(Enum):
     OUTSIDE_IMAGE = "outside_image"
     LOCAL_MINIMUM = "local_minimum"
     UNWEIGHTED = "unweighted"
+    REFITTED = "refitted"
 
     @property
     def explanation(self) -> str:
@@ -68,6 +69,10 @@ _EXPLANATIONS = {
         "The least-squares minimum was found, but from there no way to where the gradient that "
         "was to weigh the residual does so: this is the least-squares minimum, which noise biases "
         "by more than its standard errors say; try gradient_blur_px, or gradient = 'deformed'."
+    ),
+    Outcome.REFITTED: (
+        "The correlation ended where parts of the images don't match; these are the unknowns of "
+        "the ansatz refitted to the measured whole displacement."
     ),
 }
 

@@ -64,12 +64,12 @@ class LevelSearch:
         if np.array_equal(a, before):
             return a
         some = self._thinned(self._all_pixels)
-        costs = [self._equations(some, x, False).mean_square for x in (a, before)]
+        costs = [self.equations(some, x, False).mean_square for x in (a, before)]
         return a if costs[0] <= costs[1] else before
 
     def minimum(self, start: FloatArray) -> tuple[Minimum, Assembly]:
         """Find it, and the pixels it was found with."""
-        assembly = self._valid_assembly(start)
+        assembly = self.valid_assembly(start)
         history: tuple[Iteration, ...] = ()
         curvature = None
         some = self._thinned(assembly)
@@ -87,7 +87,7 @@ class LevelSearch:
             used, start, curvature = assembly, found.unknowns, found.curvature
             if self.pair.valid is None:
                 break
-            assembly = self._valid_assembly(start)
+            assembly = self.valid_assembly(start)
             if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.runs.pixels:
                 break
         return replace(found, history=history), used
@@ -113,7 +113,7 @@ class LevelSearch:
         there = root(evaluate, how.slope, length, found, self.options, self.on_iteration)
         return there, how
 
-    def _valid_assembly(self, a: FloatArray) -> Assembly:
+    def valid_assembly(self, a: FloatArray) -> Assembly:
         """All pixels, less those that these unknowns map onto no material, or off the image."""
         pair = self.pair
         if pair.valid is None:
@@ -157,7 +157,7 @@ class LevelSearch:
         most = min(1.0, limits.max_outside / kept) if kept > 0 else limits.max_outside
         tolerance = limits.coarse_tolerance_px * factor if leads else limits.tolerance_px
         return minimise(
-            partial(self._equations, assembly),
+            partial(self.equations, assembly),
             step_length(self.ansatz, assembly.grid, assembly.mask, factor),
             start,
             replace(limits, max_outside=most, tolerance_px=tolerance),
@@ -167,7 +167,8 @@ class LevelSearch:
             0.0 if self.finest else _EIGENVALUE_CUTOFF,
         )
 
-    def _equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
+    def equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
+        """Normal equations at some unknowns."""
         return assembly.images(a, self.pair.reference, self.pair.deformed, with_matrix)
 
 

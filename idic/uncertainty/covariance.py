@@ -28,6 +28,7 @@ from modeharvest.idic.ansatz import open_grid
 from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.solver.assembly import Assembly, valid_pixels
 from modeharvest.idic.solver.final_smoothing import smoothed_pair
+from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.passes import Runs, runs_of
 from modeharvest.idic.solver.pyramid import FULL, level_pair
@@ -65,6 +66,9 @@ def covariance(
     Blocks of edge ``block`` [mm], the unit cell, are taken for independent; ``edge_px`` as in
     :class:`~modeharvest.idic.setup.CorrelationOptions`.
     """
+    if result.outcome is Outcome.REFITTED:
+        why = "No error bars by model error: of that a fit to the whole displacement is free."
+        return Covariance(result.covariance(noise), None, (why,))
     blur_px = result.final_smoothing.blur_px if result.final_smoothing else 0.0
     matched = MatchedImages.of(result, smoothed_pair(pair, blur_px), edge_px)
     by_noise = matched.hessian_corrected_covariance(noise)

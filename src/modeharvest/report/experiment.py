@@ -11,6 +11,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
+from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
@@ -40,7 +41,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import headings
 from modeharvest.validation.summary import SnapshotSummary
 from modeharvest.validation.truth import Comparison, lengths, pattern_field
-from modeharvest.validation.whole_field import WholeField, WholeFieldSummary
+from modeharvest.validation.whole_field import WholeFieldSummary
 
 Snapshot = Mapping[str, Any]
 Summary = Mapping[str, Any]

@@ -208,7 +208,7 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
         return state.frame.spectrum is not None
 
     def has_local(state: PhotographState) -> bool:
-        return state.frame.local is not None
+        return state.frame.w is not None and state.frame.whole is None  # drawn above
 
     def is_known(state: PhotographState) -> bool:
         return figures.truth_of(state) is not None
@@ -220,7 +220,7 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
         *fits.spectrum_panels("photographs", "spect_real", "photographs", has_spectrum),
         *(Panel("photographs", f"S{axis}{axis}-part{k + 1}",
                 partial(figures.draw_part_spectrum, part=k, component=c), text=f"part-{axis}",
-                values={"part": part.name})
+                values={"part": part.name if part.name == "w" else f"region “{part.name}”"})
           for k, part in enumerate(parts) for c, axis in enumerate("xy")),
         *fits.ansatz_panels("found", "real", modes),
         *figures.WHOLE_MAPS.panels(),

@@ -40,7 +40,7 @@ from modeharvest.idic.photograph.displacement import (
     block_motion,
     brightness,
     displacement_from,
-    is_misfit,
+    misfit_of,
     residual,
     speckled,
 )
@@ -228,7 +228,8 @@ class MeasureRun(StagedRun[MeasureCase]):
         def work() -> tuple[Path, ...]:
             names = str(self.case.reference), str(self.case.files[name])
             pair, body = self.pair(name), self._body
-            start = block_motion(pair, body.mesh, before, names)
+            known = 0.0 * body.mesh.nodes if before is None else before.displacement
+            start = block_motion(pair, body.mesh, known, names)
             result = displacement_from(start, pair, body, progress=self.progress)
             write_result(tables[0], result, given)
             write_vtu(tables[1], result, given)
@@ -286,13 +287,6 @@ class MeasureRun(StagedRun[MeasureCase]):
         gain, offset = brightness(pair, u)
         f, material = pair.reference, pair.masks[0]
         noise = estimated_noise(f, material).sd * float(np.hypot(1.0, gain))
-        warnings = list(result.warnings)
-        if is_misfit(result, noise, f[material]):
-            warnings.append(
-                f"The residual is {result.residual_rms:.3g} grey levels, of which noise is about "
-                f"{noise:.2g}: somewhere the images don't match, see its map; give images in "
-                "between, or a mask without what is not material."
-            )
         return {
             "name": name,
             "rms_px": float(np.sqrt(np.mean(inside**2))),
@@ -306,7 +300,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "offset": offset,
             "seconds": self.timings.get(f"image {name}"),
             "image_noise": noise,
-            "warnings": warnings,
+            "warnings": [*result.warnings, *misfit_of(result, noise, f[material])],
         }
 
 

@@ -6,7 +6,7 @@ import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -18,7 +18,7 @@ from numba import get_num_threads
 from modeharvest.fem.experiment import Experiment
 from modeharvest.idic.finite_element.files import Given, read_result, write_result, write_vtu
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
-from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.result import NodalResult, WholeField, refitted
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet
@@ -29,12 +29,7 @@ from modeharvest.util.machine import available_bytes, is_alone
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.summary import MeasuredExperiment
 from modeharvest.validation.truth import Comparison
-from modeharvest.validation.whole_field import (
-    WholeField,
-    WholeFieldSummary,
-    compare_whole,
-    refitted,
-)
+from modeharvest.validation.whole_field import WholeFieldSummary, compare_whole
 
 BYTES_PER_PIXEL = 420.0
 """Of memory while an image is measured: 1.6 GB were measured for one of 4 Mpx."""
@@ -97,7 +92,7 @@ def _on_ends(half_length: float, within: float, points: FloatArray) -> BoolArray
 
 
 @contextmanager
-def _with_remedy(of: str) -> Iterator[None]:
+def with_remedy(of: str) -> Iterator[None]:
     """Say in an InputError whose whole displacement it is about, and how to do without."""
     try:
         yield
@@ -123,30 +118,15 @@ class WholeFields:
         """The HDF5 file of an image; the VTU beside it has the same name."""
         return self.folder / f"{name}.h5"
 
-    def measure(
-        self,
-        name: str,
-        of: str,
-        work: Callable[[Progress], NodalResult],
-        progress: Progress,
-        given: Given,
+    def write(
+        self, name: str, found: NodalResult, given: Given, seconds: float
     ) -> tuple[Path, Path]:
-        """Measure by ``work`` and write what was found; returns the files.
-
-        ``of``: whose it is, for messages; ``given``: for stresses and w. Raises InputError
-        where there is nothing to measure on, with the way around.
-        """
-        begin, path = time.perf_counter(), self.path(name)
-
-        def report(done: float, total: float, what: str) -> None:
-            progress(done, total, f"{what}, {of}")
-
-        with _with_remedy(of):
-            found = work(report)
+        """Write what was found in an image, and what that took; returns the files."""
+        path = self.path(name)
         make_folder(self.folder)
         write_result(path, found, given=given)
         write_vtu(path.with_suffix(".vtu"), found, given=given)
-        write_json(self._timing(name), {"seconds": time.perf_counter() - begin})
+        write_json(self._timing(name), {"seconds": seconds})
         return path, path.with_suffix(".vtu")
 
     def of_images(
@@ -165,7 +145,7 @@ class WholeFields:
         most = min(get_num_threads() if is_alone() else 1, len(images.strains))
         count = max(1, min(most, int(available_bytes() / (BYTES_PER_PIXEL * mask.size))))
         with _children(count - 1) as children:
-            with _with_remedy("mesh of the material"):
+            with with_remedy("mesh of the material"):
                 body = how.body(mask, images.grid)
             # The last state takes longest, and its progress is seen.
             first, *others = (
@@ -188,8 +168,9 @@ class WholeFields:
     ) -> tuple[WholeField, WholeFieldSummary]:
         """The k-th of a virtual experiment, refitted and set against the truth."""
         known, name = comparisons[k], name_of(comparisons[k].strain)
-        found, true = self.read(name), known.displacement
-        whole = WholeField(found, refitted(found, known.result, known.mask), self.seconds(name))
+        found, true, fit = self.read(name), known.displacement, known.result
+        refit = refitted(found, fit.ansatz, fit.unknowns, known.mask)
+        whole = WholeField(found, refit, self.seconds(name))
         return whole, compare_whole(whole, true, known.best, known.mask, measured.specimen)
 
     def read(self, name: str) -> NodalResult:
@@ -217,13 +198,20 @@ def _measure(
     """Measure images in a folder one after another, from their correlations, by strain."""
     images, law = ImageSet.read(folder), None if how.law is None else how.law.material
 
-    def one(strain: float, progress: Progress) -> NodalResult:
-        pair = images.pair(strain, camera=camera)
-        return measure_displacement(pair, results[strain], body, options=how, progress=progress)
+    def one(strain: float, result: Result) -> None:
+        begin, of = time.perf_counter(), f"strain {100 * strain:.2f} %"
+
+        def report(done: float, total: float, what: str) -> None:
+            progress(done, total, f"{what}, {of}")
+
+        with with_remedy(of):
+            pair = images.pair(strain, camera=camera)
+            found = measure_displacement(pair, result, body, options=how, progress=report)
+        given, seconds = Given(material=law, correlation=result), time.perf_counter() - begin
+        files.write(name_of(strain), found, given, seconds)
 
     for strain, result in results.items():
-        of, given = f"strain {100 * strain:.2f} %", Given(material=law, correlation=result)
-        files.measure(name_of(strain), of, partial(one, strain), progress, given)
+        one(strain, result)
 
 
 @contextmanager

@@ -182,14 +182,13 @@ class StagedRun(Stages, Generic[C]):
         records: Path,
         work: Callable[[str, tuple[str, R] | None], tuple[Sequence[Path], dict[str, Any]]],
         read: Callable[[str, dict[str, Any]], R],
-        nothing: Mapping[str, Any],
     ) -> tuple[dict[str, R], dict[str, str]]:
         """A stage for each of several images, from the last one in which something was found.
 
         ``keys``: by their names; ``work`` gets a name, and that of the last one with what was found
         there, leaves files, and returns them with the content of ``NAME_start.json`` in the folder
         ``records``; ``read`` reads them again. Returns what was found and why others failed: an
-        InputError of the work is taken down as ``failed``, beside ``nothing`` for the rest.
+        InputError of the work is taken down as ``failed``.
         """
         found: dict[str, R] = {}
         failed: dict[str, str] = {}
@@ -198,7 +197,7 @@ class StagedRun(Stages, Generic[C]):
             try:
                 files, about = work(name, next(reversed(found.items()), None))
             except InputError as error:
-                files, about = (), {"failed": str(error), **nothing}
+                files, about = (), {"failed": str(error)}
             write_json(path, to_plain({"failed": "", **about}))
             return *files, path
 

@@ -193,9 +193,8 @@ def draw_residual(state: PhotographState) -> Figure:
 
 def draw_w(state: PhotographState) -> Figure:
     """Draw the length of w = local DIC - IDIC in the deformed configuration."""
-    local, result, grid = state.frame.local, state.result, state.view.grid
-    assert local is not None
-    w = local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
+    w, grid = state.frame.w, state.view.grid
+    assert w is not None
     cells = min(fits.SMOOTH, max(40, int(max(grid.shape) * grid.pixel_size / w.spacing)))
     map_frame = state.view.map_frame(cells)
     points = np.stack(np.meshgrid(map_frame.grid.x, map_frame.grid.y), axis=-1)

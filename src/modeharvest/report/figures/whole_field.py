@@ -9,7 +9,7 @@ from typing import Any, Generic
 import numpy as np
 from matplotlib.figure import Figure
 
-from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.result import NodalResult, WholeField
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.report.figures import fits
 from modeharvest.report.figures.fits import UM, Panel, S
@@ -18,7 +18,7 @@ from modeharvest.report.model import Card, Cell, ReportTable, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import headings
 from modeharvest.validation.truth import lengths
-from modeharvest.validation.whole_field import WholeField, WholeFieldNumbers, WholeFieldSummary
+from modeharvest.validation.whole_field import WholeFieldNumbers, WholeFieldSummary
 
 _SHARE = 0.98
 """Of the pixels whose values are within the colours: at edges a few are much larger."""

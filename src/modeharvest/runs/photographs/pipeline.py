@@ -6,28 +6,36 @@
     prepared/                           prepare     photographs without distortion, masks
     results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
     results/NAME_start.json                         where it started from, in words
-    whole_field/                        measure     whole displacements, where they are asked for
+    whole_field/NAME.h5  NAME.vtu                   whole displacements, where they are asked for
+    whole_field/NAME_refit.json                     the ansatz of the result, refitted to it
     report.html  summary.json           report      everything that was found
     stages.json timings.json                        which stages are finished, what they took
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.finite_element.files import Given
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.finite_element.pixels import continued
+from modeharvest.idic.finite_element.result import WholeField
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field, write_field
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
     MeasuredPhotograph,
     image_noise,
     measure,
+    measure_whole,
     residual_test,
     warped_back,
 )
@@ -50,16 +58,17 @@ from modeharvest.runs.photographs.results import (
     amplitude_of,
     harvest_summary,
 )
-from modeharvest.runs.photographs.whole_field import PhotographWholeFields
-from modeharvest.runs.whole_field import change_of
+from modeharvest.runs.whole_field import WholeFields, change_of, with_remedy
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
-from modeharvest.util.typed import to_plain
+from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import find_buckling, mean_strain
 
+_EDGE_PX = 2
+"""A camera's pixels on an edge show some background, and taking out distortion mixes it further."""
 _ALONG = 120
 """Points of the error bars along the longer side: they are as smooth as the ansatz."""
 
@@ -123,22 +132,13 @@ class HarvestRun(StagedRun[PhotographCase]):
     def _keys(self) -> dict[str, str]:
         """Of the stages that correlate, each depending on those before it."""
         how, local, keys = self.case.plain(), self.case.local.files, {}
-        key = digest([self._prepared_key(), [how["correlation"], how["local"]]])
+        whole = how["whole_field"] if self.case.whole_field.measure else None
+        key = digest([self._prepared_key(), [how["correlation"], how["local"], whole]])
         fields = prepare.of_each_photograph(self.case, local, "local.files")
         for name in self.prepared.names:
             key = digest([key, name, sha256_of(fields[name]) if name in fields else ""])
             keys[name] = key
         return keys
-
-    @cached_property
-    def whole_fields(self) -> PhotographWholeFields | None:
-        """The stages that measure whole displacements; None where the case says not to."""
-        if not self.case.whole_field.measure:
-            return None
-        return PhotographWholeFields(
-            self.case, self.folder, self.progress,
-            prepared=self.prepared, results=self.results(), keys=self._keys,
-        )  # fmt: skip
 
     def failures(self) -> tuple[tuple[str, str], ...]:
         """Names of the photographs that were read but could not be measured, and why."""
@@ -148,10 +148,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         """All that is known of the test, for the report."""
         case, prepared, region = self.case, self.prepared, self.geometry.region
         results, source = self.results(), Path(self.source)
-        frames, wholes = [], self.whole_fields
-        for name in counted(tuple(results), self.progress, "error bars"):
-            frame = self._frame(name, results[name])
-            frames.append(frame if wholes is None else wholes.added(frame))
+        names = counted(tuple(results), self.progress, "error bars")
+        frames = [self._frame(name, results[name]) for name in names]
         moments = [amplitude_of(frame, region.cellular) for frame in frames]
         return Harvest(
             case,
@@ -200,8 +198,9 @@ class HarvestRun(StagedRun[PhotographCase]):
         def work(
             name: str, last: tuple[str, MeasuredPhotograph] | None
         ) -> tuple[Sequence[Path], dict[str, Any]]:
+            pair, (result, field, _) = self._pair(name, last), self._paths(name)
             measured = measure(
-                self._pair(name, last),
+                pair,
                 self.geometry,
                 case.specimen.cell_size,
                 case.correlation,
@@ -209,19 +208,52 @@ class HarvestRun(StagedRun[PhotographCase]):
                 last and last[1],
                 self.progress,
             )
-            result, field = self._paths(name)
+            files: Sequence[Path] = ()
+            if case.whole_field.measure:
+                measured, files = self._with_whole(name, pair, measured)
             write_field(field, measured.local)
             measured.result.write(result)
-            start = {"fixed": measured.result.ansatz.fixed, "text": measured.text}
-            return (result, field), start
+            whole = measured.whole and measured.whole.start
+            return (result, field, *files), {"whole": whole, **picked(measured, "text warnings")}
 
         def read(name: str, start: dict[str, Any]) -> MeasuredPhotograph:
-            result, field = self._paths(name)
-            outcome = Result.read(result), read_field(field)
-            return MeasuredPhotograph(*outcome, tuple(start["text"]))
+            result, field, refit = self._paths(name)
+            wholes, whole = self._wholes, None
+            if start["whole"]:
+                again = wholes.read(name), Result.read(refit), wholes.seconds(name)
+                whole = WholeField(*again, start["whole"])
+            text, warnings = tuple(start["text"]), tuple(start["warnings"])
+            return MeasuredPhotograph(Result.read(result), read_field(field), text, whole, warnings)
 
-        folder, nothing = self.folder / "results", {"fixed": False, "text": ()}
-        return self.do_in_turn("correlate", self._keys, folder, work, read, nothing)
+        return self.do_in_turn("correlate", self._keys, self.folder / "results", work, read)
+
+    @cached_property
+    def _mesh(self) -> tuple[Body, FiniteElementOptions]:
+        """Of the reference's material, and how to measure on it."""
+        how = replace(self.case.whole_field.on_mesh(), edge_px=_EDGE_PX)
+        return how.body(self.geometry.mask, self.geometry.grid), how
+
+    def _with_whole(
+        self, name: str, pair: ImagePair, first: MeasuredPhotograph
+    ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
+        """A photograph that was correlated with its whole displacement, and the files of that.
+
+        One that can't be measured so keeps its modes, and has a warning.
+        """
+        case, begin, refit = self.case, time.perf_counter(), self._paths(name)[-1]
+        try:
+            with with_remedy(name):
+                found = measure_whole(
+                    pair, self.geometry, case.specimen.cell_size, case.correlation, first,
+                    *self._mesh, self.prepared.noise, self.progress,
+                )  # fmt: skip
+        except InputError as error:
+            return replace(first, warnings=(*first.warnings, str(error))), ()
+        assert found.whole
+        given, seconds = Given(correlation=found.result), time.perf_counter() - begin
+        files = self._wholes.write(name, found.whole.measured, given, seconds)
+        found.whole.refit.write(refit)
+        return found, (*files, refit)
 
     def _frame(self, name: str, measured: MeasuredPhotograph) -> HarvestedFrame:
         """One photograph's measurement, with its error bars and spectra."""
@@ -235,8 +267,12 @@ class HarvestRun(StagedRun[PhotographCase]):
         along, across = mean_strain(result, box)
         spectrum = measured_spectrum(measured.local, cell, box)
         pattern = read_pattern(spectrum)
+        known, w = measured.local, None
         parts = geometry.parts if len(geometry.parts) > 1 else {}
-        own = {n: measured_spectrum(measured.local, cell, box) for n, box in parts.items()}
+        own = {n: measured_spectrum(known, cell, box) for n, box in parts.items()}
+        if case.whole_field.measure or case.local.code != "none":
+            w = known.less(partial(result.ansatz.displacement_at, result.unknowns))
+            own["w"] = measured_spectrum(w, cell, box)
         return HarvestedFrame(
             name=name,
             strain_x=along,
@@ -255,9 +291,10 @@ class HarvestRun(StagedRun[PhotographCase]):
             spectrum=spectrum,
             pattern=pattern,
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()),
-            local=measured.local if case.local.code != "none" else None,
+            w=w,
+            whole=measured.whole,
             start_text=tuple(s for s in measured.text if s not in pattern.text),
-            warnings=found.warnings,
+            warnings=(*found.warnings, *measured.warnings),
         )
 
     def _pair(self, name: str, last: tuple[str, MeasuredPhotograph] | None) -> ImagePair:
@@ -265,12 +302,19 @@ class HarvestRun(StagedRun[PhotographCase]):
         pair = self.prepared.pair(name)
         if self.case.correlation.formulation != "updated" or last is None:
             return pair
-        before, result = last[0], last[1].result
-        reference, inside = warped_back(self.prepared.image(before), result, result.order)
+        before, result, whole = last[0], last[1].result, last[1].whole
+        image = continued(self.prepared.image(before), self.prepared.mask(before))
+        u = whole.measured.displacement_on() if whole else None
+        reference, inside = warped_back(image, result, result.order, u)
         return replace(pair, reference=reference, mask=self.prepared.mask() & inside)
 
-    def _paths(self, name: str) -> tuple[Path, Path]:
-        return self.folder / "results" / f"{name}.json", self.folder / "results" / f"{name}.npz"
+    def _paths(self, name: str) -> tuple[Path, Path, Path]:
+        results, refit = self.folder / "results", self._wholes.folder / f"{name}_refit.json"
+        return results / f"{name}.json", results / f"{name}.npz", refit
+
+    @property
+    def _wholes(self) -> WholeFields:
+        return WholeFields(self.folder / "whole_field")
 
     def _prepared_key(self) -> str:
         tables, files = self.case.plain(), prepare.all_files(self.case)

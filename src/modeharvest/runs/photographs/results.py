@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.finite_element.result import WHOLE, WholeField
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.photograph.geometry import Geometry
@@ -31,16 +32,17 @@ from modeharvest.runs.photographs.prepare import Optics, calibration_text
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import Buckling, ImageAmplitude
-from modeharvest.validation.whole_field import WholeField, WholeFieldSummary, whole_numbers
+from modeharvest.validation.whole_field import WholeFieldSummary, whole_numbers
 
 
 @dataclass(frozen=True, eq=False)
 class PartSpectrum:
-    """Spectrum of a part of the specimen that has modes of its own, and the pattern read off it."""
+    """Spectrum of a part of the displacement, and the pattern read off it."""
 
     name: str
+    """Of a region of the specimen that has modes of its own; or "w"."""
     spectrum: Spectrum
-    """Of the displacement there without its affine part."""
+    """Of the displacement in that region, or of w, without its affine part."""
     pattern: WavePattern
 
 
@@ -72,9 +74,9 @@ class HarvestedFrame:
     pattern: WavePattern | None = None
     """What is read off the spectrum."""
     parts: tuple[PartSpectrum, ...] = ()
-    """Spectrum and pattern of every part that has modes of its own, in one order for all
-    photographs."""
-    local: LocalField | None = None
+    """In one order for all photographs."""
+    w: LocalField | None = None
+    """What the ansatz leaves of a local DIC's field, or of the whole displacement's."""
     whole: WholeField | None = None
     """The whole displacement, if it was measured."""
     start_text: tuple[str, ...] = ()
@@ -343,14 +345,13 @@ def _whole(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
 
 
 def _local(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
-    local, result, px = frame.local, frame.result, harvest.grid.pixel_size
-    if local is None:
+    w, px = frame.w, harvest.grid.pixel_size
+    if w is None:
         return None
-    w = local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
     return {
-        "source": local.source,
-        "points": local.x.size,
-        "lost": local.lost,
+        "source": WHOLE if frame.whole else w.source,
+        "points": w.x.size,
+        "lost": w.lost,
         "w_rms_px": w.rms / px,
         "sd_px": w.sd_rms / px,
         "w_beyond_noise_px": w.rms_beyond_noise / px,
