@@ -5,15 +5,26 @@ from __future__ import annotations
 import gc
 import importlib.util
 import os
+import sys
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import matplotlib
+import psutil
 import pytest
 from hypothesis import HealthCheck, settings
+from hypothesis.internal import scrutineer
 
 matplotlib.use("Agg")
+
+# Where Debian installs packages they are no code of this project's, either. hypothesis would read
+# a thousand files for numbers to try: seconds of each process, and elsewhere other examples.
+getattr(scrutineer, "SITE_PACKAGES_DIRS", set()).update(
+    Path(folder).resolve() for folder in sys.path if folder.endswith("-packages")
+)
 
 settings.register_profile(
     "modeharvest",
@@ -24,6 +35,23 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("modeharvest")
+
+FILES_THAT_TAKE_LONG = (
+    "test_pipeline.py",
+    "test_disturbed.py",
+    "test_lattice_pipeline.py",
+    "test_measure.py",
+    "test_damaged_files.py",
+    "test_fem_bloch.py",
+    "test_harvest_whole_field.py",
+    "test_fem_simulate.py",
+    "test_harvest_pipeline.py",
+    "test_harvest_sequence.py",
+    "test_harvest_patterns.py",
+    "test_whole_measure.py",
+    "test_weighting.py",
+)
+"""They come first where several processes share out the files, or one would end long after all."""
 
 WHY_SKIPPED = "needs dolfinx >= 0.9; `scripts/env python -m pytest` provides it"
 
@@ -60,20 +88,45 @@ def pytest_configure(config: pytest.Config) -> None:
         numba.set_num_threads(1)
 
 
+_compiling = pytest.StashKey[list[int]]()
+_until_finished = ExitStack()
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile what most tests need before several processes begin, or each compiles all of it."""
+    """Compile what most tests need once for several processes, or each compiles all of it."""
     if session.config.getoption("numprocesses", None):
         from modeharvest.runs.precompile import precompiling
 
-        with precompiling(("image", "correlate", "measure")) as kernels:
-            for stage in kernels.children:
-                kernels.wait(stage)
+        stages = "image", "correlate", "measure"
+        children = _until_finished.enter_context(precompiling(stages)).children.values()
+        session.config.stash[_compiling] = [child.pid for child in children]
 
 
-def pytest_collection_finish() -> None:
-    """Keep what the imports left, which is for good, out of every collection of garbage."""
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Tell a process that does a share of the tests who compiles."""
+    node.workerinput["compiling"] = node.config.stash[_compiling]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Begin with the files that take long where several processes share them out."""
+    if hasattr(config, "workerinput"):
+        order = {name: place for place, name in enumerate(FILES_THAT_TAKE_LONG)}
+        items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Wait for those who compile; keep what the imports left out of all collections of garbage."""
+    for pid in getattr(session.config, "workerinput", {}).get("compiling", ()):
+        while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+            time.sleep(0.1)
     gc.collect()
     gc.freeze()
+
+
+def pytest_sessionfinish() -> None:
+    """Leave no child behind."""
+    _until_finished.close()
 
 
 def pytest_pycollect_makemodule(

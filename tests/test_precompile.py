@@ -111,6 +111,19 @@ def test_only_what_is_missing_is_compiled_and_no_child_is_left(children: list[Ch
     assert children[0].ended
 
 
+def test_what_is_measured_with_is_compiled_after_what_it_calls(children: list[Child]) -> None:
+    stamps = {stage: precompile._stamp(stage) for stage in ("correlate", "measure")}
+    there = stamps["correlate"]
+    assert there is not None
+    there.unlink()
+    with precompiling(stamps) as kernels:
+        (child,) = children
+        assert child.command[-2:] == ["correlate", "measure"]
+        there.touch()
+        kernels.wait("correlate")  # no longer than that, though the child goes on
+        assert not child.ended
+
+
 def test_ranks_of_mpirun_start_no_children(
     children: list[Child], monkeypatch: pytest.MonkeyPatch
 ) -> None:

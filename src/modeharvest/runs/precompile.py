@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -49,23 +50,19 @@ def _correlation() -> None:
     """What the stages ``correlate`` and ``validate`` compile."""
     case, rng = Case.read(_CASE), np.random.default_rng(0)
     grid, strain = PixelGrid.centred(444, 320, 0.05), case.experiment.strains[-1]
-    ansatz = case.correlation.ansatz(case.experiment.specimen)
     f, mask = rng.random(grid.shape, np.float32), np.ones(grid.shape, np.bool_)
     options = case.correlation.options()
     options = replace(options, gauss_newton=replace(options.gauss_newton, max_iterations=1))
     pair = ImagePair(f, f[::-1].copy(), grid, mask, mask, strain=strain)
-    found = correlate(pair, ansatz, options=options)
+    found = correlate(pair, case.correlation.ansatz(case.experiment.specimen), options=options)
     best_fit(Truth.of(displacement=found.displacement()), found)
 
 
 def _measurement() -> None:
     """What the stage ``measure`` compiles beyond that."""
-    rng = np.random.default_rng(0)
-    grid = PixelGrid.centred(200, 240, 0.05)
-    f, mask = (
-        gaussian_filter(rng.random(grid.shape, np.float32), 2.0),
-        np.ones(grid.shape, np.bool_),
-    )
+    rng, grid = np.random.default_rng(0), PixelGrid.centred(200, 240, 0.05)
+    f = gaussian_filter(rng.random(grid.shape, np.float32), 2.0)
+    mask = np.ones(grid.shape, np.bool_)
     mask[80:120, 90:150] = False
     pair = ImagePair(f, f.copy(), grid, mask, mask)
     found = measure_displacement(pair, np.zeros_like, options=FiniteElementOptions(steps=1))
@@ -78,12 +75,19 @@ _PARTS: dict[str, tuple[Callable[[], None], Callable[..., object]]] = {
     "measure": (_measurement, accumulate_elements),
 }
 """By stage, a child's work, and a kernel beside which it notes that it is done."""
+_CHAINS = ("image",), ("correlate", "measure")
+"""Each child's stages: what measures calls kernels of both others, and finds them compiled."""
 
 
 def _stamp(stage: str) -> Path | None:
     """The note; deleted with the kernels by who deletes ``*.nbi``. None without a cache."""
     folder = cached_in(_PARTS[stage][1])
     return None if folder is None else folder / f"precompiled-{sources()}.nbi"
+
+
+def _is_missing(stage: str) -> bool:
+    stamp = _stamp(stage)
+    return stamp is not None and not stamp.exists()
 
 
 @dataclass(frozen=True)
@@ -95,43 +99,40 @@ class Precompilation:
     def wait(self, stage: str, progress: Progress = silent) -> None:
         """Wait for the kernels of a stage: two who compile the same are no faster than one."""
         child = self.children.get(stage)
-        if child is not None and child.poll() is None:
+        while child is not None and child.poll() is None and _is_missing(stage):
             progress(0, 1, "compile kernels, once")
-            child.wait()
+            time.sleep(0.1)
 
 
 @contextmanager
 def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
-    """Start a child for each stage whose kernels are not there yet; none is left in the end."""
-    children = {}
+    """Start children for the stages whose kernels are not there yet; none is left in the end."""
+    children, missing = {}, set(filter(_is_missing, stages))
     if is_alone() and (os.cpu_count() or 1) > 1:
-        for stage in stages:
-            stamp = _stamp(stage)
-            if stamp is not None and not stamp.exists():
-                command = [sys.executable, "-m", "modeharvest.runs.precompile", stage]
+        for chain in _CHAINS:
+            if todo := [stage for stage in chain if stage in missing]:
+                command = [sys.executable, "-m", "modeharvest.runs.precompile", *todo]
                 nowhere = subprocess.DEVNULL
-                children[stage] = subprocess.Popen(
-                    command, stdin=nowhere, stdout=nowhere, stderr=nowhere
-                )
+                child = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere)
+                children |= dict.fromkeys(todo, child)
     try:
         yield Precompilation(children)
     finally:
         for child in children.values():
-            if child.poll() is None:
-                child.kill()
+            child.kill()
             child.wait()
 
 
-def _main(stage: str) -> None:
+def _main(stages: list[str]) -> None:
     if hasattr(os, "nice"):
         os.nice(10)  # the finite elements go first
-    _PARTS[stage][0]()
-    stamp = _stamp(stage)
-    if stamp is not None:
-        for old in stamp.parent.glob("precompiled-*.nbi"):
-            old.unlink(missing_ok=True)
-        stamp.touch()
+    for stage in stages:
+        _PARTS[stage][0]()
+        if (stamp := _stamp(stage)) is not None:
+            for old in stamp.parent.glob("precompiled-*.nbi"):
+                old.unlink(missing_ok=True)
+            stamp.touch()
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1])
+    _main(sys.argv[1:])
