@@ -69,6 +69,14 @@ def _dolfinx_is_missing() -> bool:
     return not required and importlib.util.find_spec("dolfinx") is None
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_power_failure() -> Iterator[None]:
+    """Let files reach the disk when they like: what tests kill is processes, not the machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
 @pytest.fixture(scope="module")
 def coarse_pictures() -> Iterator[None]:
     """Draw the fields of reports with few pixels, where a test is not about its pictures."""
@@ -77,6 +85,17 @@ def coarse_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "DPI", 65)
         yield
+
+
+@pytest.fixture
+def unrendered_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose the figures of reports, but leave out their SVG, where a test is not about them.
+
+    What a module's fixtures have made before is whole.
+    """
+    from modeharvest.report.figures import style
+
+    monkeypatch.setattr(style, "to_svg", lambda *_, **__: "<svg></svg>")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -27,7 +27,7 @@ from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
 from modeharvest.runs.photographs.prepare import named_files
 from modeharvest.util.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("coarse_pictures")
+pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
 
 PIXEL, NOISE = 0.05, 0.01
 EXPERIMENT = f"""

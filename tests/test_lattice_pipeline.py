@@ -34,7 +34,10 @@ from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 from modeharvest.util.files import read_json
 from modeharvest.validation.studies.lattice import StudyPlan
 
-pytestmark = [pytest.mark.dolfinx, pytest.mark.usefixtures("coarse_pictures")]
+pytestmark = [
+    pytest.mark.dolfinx,
+    pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures"),
+]
 
 COARSE = """
 title = "A coarse lattice"

@@ -27,7 +27,7 @@ from modeharvest.runs.measure import measure
 from modeharvest.util.errors import InputError
 
 pytest.importorskip("gmsh")
-pytestmark = pytest.mark.usefixtures("coarse_pictures")
+pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
 
 GAIN, OFFSET = 0.8, 20.0
 """Of the second deformed image's brightness, in 8-bit levels."""

@@ -218,6 +218,7 @@ def test_running_again_changes_nothing(case: Path, folder: Path) -> None:
     assert stamps(folder) == before
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_a_changed_option_repeats_only_what_depends_on_it(case: Path, folder: Path) -> None:
     before = stamps(folder)
     other = case.with_name("other.toml")
@@ -231,6 +232,7 @@ def test_a_changed_option_repeats_only_what_depends_on_it(case: Path, folder: Pa
     }
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 @pytest.mark.parametrize("step", ["images: strain", "correlate", "report"])
 def test_an_interrupted_run_continues_to_the_same_end(
     case: Path, finished: Path, tmp_path: Path, step: str
@@ -251,6 +253,7 @@ def test_an_interrupted_run_continues_to_the_same_end(
     assert run(case, folder) == read_json(finished / "summary.json")
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 @pytest.mark.parametrize(
     ("victim", "damage", "stage"),
     [
@@ -352,6 +355,7 @@ def test_a_solution_of_the_same_experiment_is_taken(case: Path, folder: Path) ->
     assert Run(other, folder / "foreign", solution=foreign).image().strains == (0.08, 0.15)
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_strain_beyond_what_converges_is_told_and_the_rest_is_kept(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
