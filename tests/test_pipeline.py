@@ -146,7 +146,7 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
     measured = sorted((folder / "whole_field").glob("*.h5"))
     content = [path.read_bytes() for path in measured]
     shutil.rmtree(folder / "whole_field")
-    run(whole, folder)
+    Run(whole, folder).measure()
     assert [path.read_bytes() for path in measured] == content
 
 

@@ -201,7 +201,10 @@ def experiment_report(summary: Summary, data: ExperimentData | None = None) -> R
         findings=[
             critical_line(summary.get("critical_strain"), material),
             *_expected(summary.get("expected", [])),
-            *_energies(summary),
+            *(
+                text_of("experiment-energy", **row)
+                for row in summary.get("energy_below_unstable", [])
+            ),
         ],
         keys=key_numbers(summary),
         brief=ReportTable.of_states("brief", brief),
@@ -238,11 +241,6 @@ def _expected(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if missed:
         return [f"Missed {len(missed)} of {len(rows)} expected values: {'; '.join(missed)}."]
     return [f"All {len(rows)} expected values are met."] if rows else []
-
-
-def _energies(summary: Summary) -> list[str]:
-    rows = summary.get("energy_below_unstable", [])
-    return [text_of("experiment-energy", **row) for row in rows]
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:

@@ -107,7 +107,8 @@ class Precompilation:
 @contextmanager
 def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
     """Start children for the stages whose kernels are not there yet; none is left in the end."""
-    children, missing = {}, set(filter(_is_missing, stages))
+    children: dict[str, subprocess.Popen[bytes]] = {}
+    missing = set(filter(_is_missing, stages))
     if is_alone() and (os.cpu_count() or 1) > 1:
         for chain in _CHAINS:
             if todo := [stage for stage in chain if stage in missing]:

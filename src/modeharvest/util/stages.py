@@ -161,7 +161,10 @@ class Stages:
 
     def _remember(self, name: str, key: str, files: Iterable[Path]) -> None:
         """Take down that a stage is finished."""
-        entries = {path.relative_to(self.folder).as_posix(): _entry(path) for path in files}
+        entries = {
+            path.relative_to(self.folder).as_posix():
+            {"bytes": path.stat().st_size, "sha256": sha256_of(path)} for path in files
+        }  # fmt: skip
         record = {**self._record(), name: {"key": key, "files": entries}}
         write_json(self.folder / RECORD, dict(sorted(record.items())))
 
@@ -233,10 +236,6 @@ def _table(path: Path) -> dict[str, Any]:
     except InputError:
         return {}
     return content if isinstance(content, dict) else {}
-
-
-def _entry(path: Path) -> dict[str, Any]:
-    return {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
 
 
 def _is_whole(path: Path, entry: object) -> bool:

@@ -140,7 +140,8 @@ class LatticePatch:
         numbers = number.reshape(len(copies), -1)
         cells = numbers[:, mesh.cells].reshape(-1, 6)
         joined = Mesh(mesh.nodes[node] + copy @ lattice, cells, "T6")
-        return cls(joined, MeshBoundary.of(joined), lattice, node, copy, _middle(mesh), size)
+        middle = np.asarray(0.5 * (mesh.nodes.min(axis=0) + mesh.nodes.max(axis=0)))
+        return cls(joined, MeshBoundary.of(joined), lattice, node, copy, middle, size)
 
     @property
     def limits(self) -> tuple[float, float, float, float]:
@@ -166,10 +167,6 @@ class LatticePatch:
         stretch = np.asarray(gradient) - np.eye(2)
         offsets = self.copy @ self.lattice - self.centre
         return np.asarray(values[self.node] + offsets @ stretch.T)
-
-
-def _middle(mesh: Mesh) -> FloatArray:
-    return np.asarray(0.5 * (mesh.nodes.min(axis=0) + mesh.nodes.max(axis=0)))
 
 
 def _cells_in_window(mesh: Mesh, lattice: FloatArray, window: FloatArray) -> IntArray:
