@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,6 +135,12 @@ def reference_points(ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID) -> F
     return inverted(displacement, np.stack(np.meshgrid(grid.x, grid.y), axis=-1), 1e-13)
 
 
+@lru_cache(maxsize=4)
+def _points_of_last(ansatz: Ansatz, a: bytes, grid: PixelGrid) -> FloatArray:
+    """Those of the unknowns' bytes: many speckles are displaced alike."""
+    return reference_points(ansatz, np.frombuffer(a), grid)
+
+
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """(n, 2) of matrices (n, 2, 2) and right-hand sides (n, 2)."""
     (p, q), (r, s) = np.moveaxis(matrix, 0, -1)
@@ -145,6 +152,6 @@ def image_pair(
     pattern: Pattern, ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID
 ) -> tuple[FloatArray, FloatArray]:
     """Make f on the grid, and g(x + u(x)) = f(x)."""
-    reference = reference_points(ansatz, a, grid)
+    reference = _points_of_last(ansatz, a.tobytes(), grid)
     f = pattern(*np.meshgrid(grid.x, grid.y))
     return f, pattern(reference[..., 0], reference[..., 1])

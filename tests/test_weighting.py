@@ -162,6 +162,13 @@ def test_a_displacement_left_over_keeps_the_least_squares_minimum() -> None:
 
 
 @cache
+def noise_free_inverse(seed: int) -> FloatArray:
+    """(n, n) M^-1 of the images without noise."""
+    images = ImagePair(*pair(seed), GRID, MASK)
+    return correlate(images, ANSATZ, guess=truth(), options=LEAST_SQUARES).inverse
+
+
+@cache
 def monte_carlo(options: CorrelationOptions) -> tuple[FloatArray, FloatArray, list[Result]]:
     """(pairs, 2, n) errors under n and -n, (pairs, n, n) covariances at the bound, results.
 
@@ -175,7 +182,6 @@ def monte_carlo(options: CorrelationOptions) -> tuple[FloatArray, FloatArray, li
     errors, bounds, results = [], [], []
     for seed in range(PAIRS):
         f, g = pair(seed)
-        clean = correlate(ImagePair(f, g, GRID, MASK), ANSATZ, guess=truth(), options=LEAST_SQUARES)
         noise = NOISE * np.random.default_rng([seed, 7]).normal(size=(2, *GRID.shape))
         found = [
             correlate(ImagePair(f + s * noise[0], g + s * noise[1], GRID, MASK), ANSATZ,
@@ -183,7 +189,7 @@ def monte_carlo(options: CorrelationOptions) -> tuple[FloatArray, FloatArray, li
             for s in (1, -1)
         ]  # fmt: skip
         errors.append([r.unknowns - truth() for r in found])
-        bounds.append(NOISE**2 * weight * clean.inverse)
+        bounds.append(NOISE**2 * weight * noise_free_inverse(seed))
         results += found
     return np.array(errors), np.array(bounds), results
 

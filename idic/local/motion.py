@@ -168,10 +168,8 @@ CELL_PX = 48
 """Binned pixels a unit cell: enough to see its pattern, few enough to be quick."""
 BLUR = 2.0
 """Of the binned images [binned px]."""
-WINDOW = 3.75
-"""Standard deviation of a Gaussian window [binned px]."""
-WARPS, SMALL = 8, 32
-"""Iterations on each level of the flow's own pyramid, and the size where it ends [px]."""
+WINDOW, WARPS, SMALL = 3.75, 8, 32
+"""Standard deviation of a window [binned px]; iterations a level; where the pyramid ends [px]."""
 STEP = 2
 """Distance of the field's points [binned px]."""
 DITHER = 1e-3

@@ -86,8 +86,7 @@ def _stamp(stage: str) -> Path | None:
 
 
 def _is_missing(stage: str) -> bool:
-    stamp = _stamp(stage)
-    return stamp is not None and not stamp.exists()
+    return (stamp := _stamp(stage)) is not None and not stamp.exists()
 
 
 @dataclass(frozen=True)
