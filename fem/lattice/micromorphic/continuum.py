@@ -10,6 +10,7 @@ are shared out over the ranks of a communicator; everything else every rank has.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -78,13 +79,15 @@ class HomogenizedBody:
             raise InputError("homogenized body: expected a material of the bulk, got none")
         self.mode_count, self.is_lattice = counts.pop(), lattice
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-        self.length = float(length if length is not None else high[0] - low[0])
+        self.copies = 4 if loading.quarter else 1
+        """How many such bodies make up the whole."""
+        self.length = float(length or (high - low)[0] * math.sqrt(self.copies))
         self._number_unknowns()
         self.regions = [self._region(lattice, points, self.mode_count)]
         if not lattice.all():
             self.regions.append(self._region(~lattice, points, 0))
         self._constrain(low, high)
-        self._find_pattern()
+        self._find_entries()
         self.point_count = self.regions[0].at.weights.size
         count = self.point_count * len(self.rves)
         if comm.size > count:
@@ -107,7 +110,7 @@ class HomogenizedBody:
         comm: MPI.Comm = MPI.COMM_WORLD,
     ) -> HomogenizedBody:
         """A rectangle of holes with its bulk edges, of the RVEs' material unless given."""
-        mesh, lattice = specimen_mesh(specimen, divisions)
+        mesh, lattice = specimen_mesh(specimen, divisions, loading.quarter)
         solid = bulk or (rves if isinstance(rves, RVE) else rves[0]).material
         return cls(mesh, rves, loading, specimen.length, solid, lattice, points, comm)
 
@@ -177,6 +180,14 @@ class HomogenizedBody:
         on = [np.abs(nodes - edge) < near for edge in (low, high)]
         plates, sides = [e[:, 0] for e in on], [e[:, 1] for e in on]
         held, direction = np.zeros(self.size, bool), np.zeros(self.size)
+        if loading.quarter:
+            mirrors, plates[0], sides[0] = (
+                (plates[0], sides[0]),
+                np.zeros(len(nodes), bool),
+                sides[1],
+            )
+            for axis, mirror in enumerate(mirrors):
+                held[self._u_dofs[mirror, axis]] = True
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
         for sign, plate in zip((1.0, -1.0), plates, strict=True):
             y = (nodes[plate, 1] - middle[1]) / half[1]
@@ -238,22 +249,17 @@ class HomogenizedBody:
                 "give plates more than one node, clamp them or guide the sides"
             )
 
-    def _find_pattern(self) -> None:
-        """Where every entry of the elements' matrices goes among those of the stiffness."""
-        rows, columns, kept = [], [], []
+    def _find_entries(self) -> None:
+        """Where the entries of the elements' matrices go in the stiffness of y."""
+        rows, columns = [], []
         for region in self.regions:
             place = self.place[region.dofs]
             row, column = np.broadcast_arrays(place[:, :, None], place[:, None, :])
-            is_free = (row >= 0) & (column >= 0)
-            kept.append(is_free.ravel())
-            rows.append(row[is_free])
-            columns.append(column[is_free])
-        numbers = np.concatenate(rows) * self.free_count + np.concatenate(columns)
-        entries, self._entry = np.unique(numbers, return_inverse=True)
-        self._kept = np.concatenate(kept)
-        self._indices = entries % self.free_count
-        counts = np.bincount(entries // self.free_count, minlength=self.free_count)
-        self._indptr = np.concatenate([[0], np.cumsum(counts)])
+            rows.append(row.ravel())
+            columns.append(column.ravel())
+        entries = np.concatenate(rows), np.concatenate(columns)
+        self._kept = np.flatnonzero((entries[0] >= 0) & (entries[1] >= 0))
+        self._entries = entries[0][self._kept], entries[1][self._kept]
 
     def expand(self, y: FloatArray) -> FloatArray:
         """(size,) all unknowns, those of the load 0, from y."""
@@ -267,8 +273,7 @@ class HomogenizedBody:
     def matrix(self, element_matrices: Sequence[FloatArray]) -> csr_array:
         """The sparse matrix of y from those of the regions' elements (c, d, d)."""
         values = np.concatenate([K.ravel() for K in element_matrices])[self._kept]
-        data = np.bincount(self._entry, values, len(self._indices))
-        return csr_array((data, self._indices, self._indptr), (self.free_count,) * 2)
+        return csr_array((values, self._entries), (self.free_count,) * 2)
 
     def summed(self, element_forces: Sequence[FloatArray]) -> FloatArray:
         """(size,) forces on all unknowns from those of the regions' elements (c, d)."""
@@ -305,11 +310,17 @@ class LinearisedBody:
     """The equations of both scales at a trial state, the RVEs condensed.
 
     ``residual`` and ``load_force`` (free_count,) are the forces on y [N/mm], RVEs relaxed, and
-    their derivative by the load; ``forces`` and ``along_load`` (size,) the same on all unknowns,
-    ``load_size`` the norm of the latter; ``stiffness`` is the derivative by y. ``excess`` is the
-    largest imbalance of an RVE over what a unit of F̄ makes there; ``rve_negative`` the number of
-    the RVEs' negative eigenvalues at fixed strains.
+    their derivative by the load, ``relaxed`` and ``along`` the changes of y that balance them;
+    ``forces`` and ``along_load`` (size,) the same on all unknowns, ``load_size`` the norm of the
+    latter; ``stiffness`` is the derivative by y. ``excess`` is the largest imbalance of an RVE over
+    what a unit of F̄ makes there; ``negative`` the number of negative eigenvalues, ``rve_negative``
+    of the RVEs' at fixed strains.
     """
+
+    stresses: FloatArray
+    moduli: FloatArray
+    rve_negative: int
+    is_regular: bool
 
     def __init__(self, body: HomogenizedBody, load: float, value: FloatArray) -> None:
         self.body, self.load, self.value = body, load, value
@@ -339,13 +350,21 @@ class LinearisedBody:
         self.load_force = body.restrict(self.along_load)
         self.load_size = float(np.linalg.norm(self.along_load))
         self.stiffness = body.matrix(matrices)
+        try:
+            factor = body.factor(self.stiffness)
+        except ArithmeticError:
+            self.is_regular = False
+            return
+        self.relaxed, self.along = -factor.solve(
+            np.column_stack([self.residual, self.load_force])
+        ).T
+        self.negative = factor.negative_pivots + self.rve_negative
 
     def _condense(self) -> None:
         """Condense this rank's RVEs, and exchange what all ranks need of them."""
         body, count = self.body, 4 + 3 * self.body.mode_count
         rows = np.full((len(body.own), count * (count + 1) + 2), np.nan)
-        self._relaxed: list[FloatArray] = []
-        self._response: list[FloatArray] = []
+        self._rves: list[tuple[FloatArray, FloatArray]] = []
         for row, number, w in zip(rows, body.own, body.fluctuations(self.value), strict=True):
             rve = body.rve(number)
             at = rve.condensed(self.strains[number // len(body.rves)], w)
@@ -354,8 +373,7 @@ class LinearisedBody:
             excess = np.linalg.norm(at.forces) / np.linalg.norm(at.on_carriers[:, :_FIRST_ORDER])
             known = at.relaxed_forces / rve.area, at.condensed.ravel() / rve.area
             row[:] = np.concatenate([*known, [excess, at.negative]])
-            self._relaxed.append(at.relaxed)
-            self._response.append(at.response)
+            self._rves.append((at.relaxed, at.response))
         every = body.gathered(rows)
         self.is_regular = bool(np.isfinite(every).all())
         if not self.is_regular:
@@ -372,7 +390,7 @@ class LinearisedBody:
         dq = np.einsum("cpsd,cd->cps", body.regions[0].B, da[body.regions[0].dofs])
         dq = dq.reshape(body.point_count, -1)
         parts = [dy]
-        for number, relaxed, response in zip(body.own, self._relaxed, self._response, strict=True):
+        for number, (relaxed, response) in zip(body.own, self._rves, strict=True):
             follows = response @ dq[number // len(body.rves)]
             parts.append(relaxed + follows if relax else follows)
         return np.concatenate(parts)

@@ -100,11 +100,12 @@ def rectangle_mesh(x: Sequence[float], y: Sequence[float]) -> Mesh:
 
 
 def specimen_mesh(
-    specimen: Specimen, divisions: tuple[int, int] | None = None
+    specimen: Specimen, divisions: tuple[int, int] | None = None, quarter: bool = False
 ) -> tuple[Mesh, BoolArray]:
     """Q8 elements of a specimen, and which of them (m,) are lattice; the others are solid bulk.
 
     divisions : of the cellular part along x and y; by default one for two holes, at least two.
+    quarter : only that with x, y >= 0, of half the divisions (rounded up).
     """
     half, whole = specimen.cellular_half_size, specimen.half_size
     counts = divisions or [max(2, round(0.5 * n)) for n in (specimen.holes_x, specimen.holes_y)]
@@ -112,8 +113,10 @@ def specimen_mesh(
         raise InputError(f"macroscopic mesh: expected divisions of 1 or more, got {divisions}")
     places = []
     for inner, outer, count in zip(half, whole, counts, strict=True):
-        inside = np.linspace(-inner, inner, count + 1)
-        places.append(np.unique([-outer, *inside, outer]))
+        if quarter:
+            places.append(np.unique([*np.linspace(0.0, inner, (count + 1) // 2 + 1), outer]))
+        else:
+            places.append(np.unique([-outer, *np.linspace(-inner, inner, count + 1), outer]))
     mesh = rectangle_mesh(*places)
     middles = mesh.nodes[mesh.cells[:, :4]].mean(axis=1)
     return mesh, np.all(np.abs(middles) < half, axis=1)

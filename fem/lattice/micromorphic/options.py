@@ -34,6 +34,9 @@ class PlateLoading:
     pattern_at_bulk: str = "zero"
     """Whether v is 0 where the lattice meets a plate, and where it meets solid bulk, or "free":
     Lambda . n = 0 there."""
+    quarter: bool = False
+    """Whether the body is the quarter x, y >= 0 of one that is its own mirror image: u symmetric,
+    v even. Compression only. Instabilities of another symmetry, such as bowing, aren't seen."""
 
     def __post_init__(self) -> None:
         require_edges(self.plates)
@@ -42,6 +45,8 @@ class PlateLoading:
             raise InputError(f"plates: expected finite rates, one of them not 0, got {rates}")
         if self.shear and self.plates != "clamped":
             raise InputError("plates: expected clamped ones to shear a specimen, got 'sliding'")
+        if self.quarter and (self.shear or self.bending or self.sides != "free"):
+            raise InputError("quarter: expected compression between free sides, got another load")
         if self.sides not in SIDES:
             raise InputError(f"sides: expected one of {SIDES}, got {self.sides!r}")
         if self.bending and self.sides == "periodic":

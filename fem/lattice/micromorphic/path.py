@@ -32,7 +32,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
-_ITERATIONS = 12
+_ITERATIONS = 8
 # What a change of the load by this makes: forces that one more Newton step turns into nothing, so
 # that its linearisation, by 1e-7 off, serves for moduli and inertia.
 _SMALL = 1e-7
@@ -149,40 +149,29 @@ class HomogenizedPath:
             self.linearisations += 1
             if not at.is_regular:
                 return None
-            try:
-                factor = self.body.factor(at.stiffness)
-            except ArithmeticError:
-                return None
-            dy, along = -factor.solve(np.column_stack([at.residual, at.load_force])).T
-            change = 0.0
+            dy, change = at.relaxed, 0.0
             if weights is not None:
                 miss = weights @ (value[:count] + dy) - amplitude
-                change = -float(miss / (weights @ along))
-            dy = dy + change * along
+                change = -float(miss / (weights @ at.along))
+            dy = dy + change * at.along
             load, value = load + change, value + at.moved(dy, change)
             if not np.isfinite(value).all():
                 return None
             rest = float(np.linalg.norm(at.residual)) + abs(change) * at.load_size
             if rest <= _SMALL * at.load_size and at.excess <= _SMALL:
                 self.last = at
-                return self._settled(at, load, value, dy, along, factor.negative_pivots, branch)
+                return self._settled(load, value, dy, branch)
         return None
 
     def _settled(
-        self,
-        at: LinearisedBody,
-        load: float,
-        value: FloatArray,
-        dy: FloatArray,
-        along: FloatArray,
-        negative: int,
-        branch: str,
+        self, load: float, value: FloatArray, dy: FloatArray, branch: str
     ) -> HomogenizedState | None:
         """The state that a last, small step from a linearisation leads to.
 
         None where an element of an RVE is turned inside out.
         """
-        body, areas = self.body, [region.at.weights.ravel() for region in self.body.regions]
+        at, body = self.last, self.body
+        areas = [region.at.weights.ravel() for region in self.body.regions]
         unknowns = body.unknowns(value, load)
         strains, rows = body.strains(unknowns), np.empty((len(body.own), 2))
         for row, number, w in zip(rows, body.own, body.fluctuations(value), strict=True):
@@ -198,17 +187,17 @@ class HomogenizedPath:
         work_rate = body.direction @ (at.forces + (load - at.load) * at.along_load)
         return HomogenizedState(
             load=load,
-            force=float(work_rate + at.load_force @ dy) / body.length,
-            energy=energy,
+            force=body.copies * float(work_rate + at.load_force @ dy) / body.length,
+            energy=body.copies * energy,
             displacement=body.displacement(unknowns),
             amplitudes=body.amplitudes(unknowns),
             strains=strains[0],
             stresses=stresses,
-            negative_eigenvalues=negative + at.rve_negative,
+            negative_eigenvalues=at.negative,
             rve_negative=at.rve_negative,
             pattern_negative=self._pattern_negative(at.stiffness),
             value=value,
-            rate=at.moved(along, 1.0, relax=False),
+            rate=at.moved(at.along, 1.0, relax=False),
             branch=branch,
         )
 
@@ -252,7 +241,9 @@ class HomogenizedPath:
         is_rve = block == "all" and ends[1].rve_negative > rve_negative
 
         def at(load: float) -> HomogenizedState:
-            near = [known[at] for at in sorted(known, key=lambda at: -abs(at - load))]
+            # Not from states so near to a singular one that rounding moves their v.
+            far = [e for e in known if abs(e - load) > 100 * tolerance or e == load]
+            near = [known[e] for e in sorted(far or known, key=lambda e: -abs(e - load))]
             found = self.equilibrium(load, _expected(near, load))
             if found is None:
                 raise ArithmeticError(f"no equilibrium at the load {load}")
@@ -364,7 +355,7 @@ class HomogenizedPath:
             # Under a prescribed load Newton may fall back to the primary path.
             if state is None or reached < 0.2 * amplitude:
                 reach = 0.5 * (points[-1].amplitude + amplitude)
-                if reach - points[-1].amplitude < 0.1 * first:
+                if reach - points[-1].amplitude < 0.02 * first:
                     return found, f"no equilibrium beyond the load {points[-1].load:.6g}"
                 continue
             rate = float(weights @ state.rate[: self.body.free_count])

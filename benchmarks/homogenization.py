@@ -1,0 +1,317 @@
+"""Micromorphic homogenization against Bloch waves, direct simulations and an independent code.
+
+``scripts/env python benchmarks/homogenization.py [SECTION ...]`` prints the tables of
+docs/homogenization.md, as Markdown:
+
+- ``cell``: homogeneous patterns: critical strain and stress on the branch, against Bloch waves and
+  the branch of the periodic cell.
+- ``strips``: n cells between clamped plates, periodic sideways: direct simulations (mean of two
+  positions of the lattice against the plates), and homogenized ones.
+- ``specimen``: the 6 x 10 specimen, direct and homogenized.
+- ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to it.
+- ``cost``: seconds and memory a linearisation and RVE, from 60 to 10 000 RVEs.
+
+Everything has square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material, elements of
+0.2 mm. All sections together take about a quarter of an hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.fem.bloch.critical import first_critical
+from modeharvest.fem.bloch.modes import ModeSet
+from modeharvest.fem.bloch.postbuckling import follow
+from modeharvest.fem.bloch.real_modes import real_modes
+from modeharvest.fem.experiment import Experiment, PathOptions
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, square
+from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
+from modeharvest.fem.lattice.micromorphic.options import PlateLoading
+from modeharvest.fem.lattice.micromorphic.path import Homogenized, homogenize
+from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern
+from modeharvest.fem.lattice.micromorphic.rve import RVE
+from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxial, uniaxial_strain
+from modeharvest.fem.materials import Ogden
+from modeharvest.fem.meshing import SIGNS, join, quarter_cell
+from modeharvest.fem.path.bifurcation import follow_branch, locate_critical
+from modeharvest.fem.path.continuation import PathFollower
+from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
+from modeharvest.fem.simulate import simulate
+from modeharvest.fem.specimen import Specimen
+
+FloatArray = NDArray[np.float64]
+PITCH, DIAMETER, SIZE = 1.9, 1.5, 0.2
+JUNCTION, HOLE = (0.5 * PITCH, 0.5 * PITCH), (0.0, 0.0)
+MATERIAL, PATTERN = Ogden(), rotation_pattern(PITCH)
+REFERENCE = {4: (7.445, 6.604), 6: (6.223, 5.948), 8: (5.791, 5.665), 10: (5.585, 5.523)}
+REFERENCE |= {12: (5.478, 5.442)}
+"""Critical strains [%] of strips, direct and micromorphic, by an independent code (T6, 0.2 mm)."""
+
+
+def row(*cells: object) -> None:
+    print("|", " | ".join(str(cell) for cell in cells), "|", flush=True)
+
+
+def head(*cells: str) -> None:
+    print()
+    row(*cells)
+    print("|" + "---|" * len(cells))
+
+
+def supercell() -> UnitCell:
+    return square(PITCH, DIAMETER, SIZE).enlarged(2, 2)
+
+
+@cache
+def analytic(centre: tuple[float, float] = JUNCTION) -> RVE:
+    return RVE(supercell(), MATERIAL, [PATTERN], centre)
+
+
+@cache
+def bloch_modes(loading: MacroLoading) -> ModeSet:
+    primitive = PeriodicCell(square(PITCH, DIAMETER, SIZE), MATERIAL)
+    found = first_critical(CellPath(primitive, loading), CriticalSearch(divisions=2))
+    return real_modes(primitive, found.state, found.waves)
+
+
+@cache
+def computed() -> RVE:
+    modes = bloch_modes(uniaxial_strain())
+    return RVE(UnitCell(modes.mesh, modes.lattice), MATERIAL, list(modes.shapes), JUNCTION)
+
+
+def cell() -> None:
+    head("loading", "what", "homogenized", "lattice", "difference")
+    held = PlateLoading(sides="periodic", pattern_at_plates="free")
+    loose = PlateLoading(plates="sliding", pattern_at_plates="free")
+    for name, plates, loading in (
+        ("uniaxial strain", held, uniaxial_strain()),
+        ("uniaxial stress", loose, uniaxial()),
+    ):
+        body = HomogenizedBody.of_specimen(
+            Specimen(2, 2, bulk_x=0, bulk_y=0), analytic(), plates, divisions=(1, 1)
+        )
+        found, modes = homogenize(body, [0.1]), bloch_modes(loading)
+        assert found.critical is not None
+        e, exact = found.critical.load, modes.load
+        row(name, "critical strain", f"{e:.6%}", f"{exact:.6%}", f"{e / exact - 1:.1e}")
+        path = CellPath(PeriodicCell(supercell(), MATERIAL), loading)
+        branch = follow(path, modes, (1.0,), [0.1]).states[0]
+        P, exact = -found.states[0].stresses[0, 0], -branch.stress[0, 0]
+        row("", "stress at 10 % [MPa]", f"{P:.8f}", f"{exact:.8f}", f"{P / exact - 1:.1e}")
+
+
+def strip_mesh(cells: int, is_cut: bool) -> Mesh:
+    """From the centres of one row of holes to those of the next, where u_y = 0 by symmetry.
+
+    Plates touch the lattice between holes or, ``is_cut``, cut through them.
+    """
+    quarter, half = quarter_cell(PITCH, DIAMETER, SIZE), 0.5 * cells * PITCH
+    columns = (
+        np.arange(cells + 1) * PITCH - half
+        if is_cut
+        else np.arange(cells) * PITCH + JUNCTION[0] - half
+    )
+    blocks = [
+        quarter.placed(sign, (float(x), -0.5 * sign[1] * PITCH))
+        for x in columns
+        for sign in SIGNS
+        if abs(x + 0.25 * sign[0] * PITCH) < half
+    ]
+    return join(blocks, 1e-7 * PITCH)
+
+
+def direct_strip(cells: int, is_cut: bool) -> tuple[float, list[float]]:
+    """Critical strain and nominal stresses at 8 and 10 % [MPa] of a strip."""
+    mesh, length = strip_mesh(cells, is_cut), cells * PITCH
+    edge = mesh.nodes[np.abs(np.abs(mesh.nodes[:, 1]) - 0.5 * PITCH) < 1e-6]
+    pins = tuple((float(x), float(y)) for x, y in edge)
+    structure = Structure(mesh, MATERIAL, EdgeCompression(0.5 * length, length, pins=pins))
+    follower = PathFollower(structure, PathOptions(first_step=0.02, largest_step=0.02))
+    path = [follower.start()]
+    follower.follow_primary(path, (0.12,), until_unstable=True)
+    critical = locate_critical(follower, path[-2], path[-1])
+    assert critical is not None
+    states = follow_branch(follower, critical, [0.08, 0.1], 1, PITCH)
+    return critical.strain, [structure.reaction(s.u, length) / PITCH for s in states]
+
+
+def homogenized_strip(cells: int, rve: RVE) -> tuple[float, list[float]]:
+    specimen = Specimen(cells, 2, bulk_x=0, bulk_y=0)
+    body = HomogenizedBody.of_specimen(
+        specimen, rve, PlateLoading(sides="periodic"), divisions=(cells, 1)
+    )
+    found = homogenize(body, [0.08, 0.1])
+    critical = found.critical.load if found.critical else np.nan
+    return critical, [state.force / (2 * PITCH) for state in found.states]
+
+
+def strips() -> None:
+    head(
+        "cells", "direct ε_c [%]", "analytic φ", "Bloch φ", "first order",
+        "direct stress at 8, 10 % [MPa]", "analytic φ", "Bloch φ", "first order", "independent: direct, analytic φ",
+    )  # fmt: skip
+    free = PlateLoading(sides="periodic", pattern_at_plates="free")
+    one = Specimen(2, 2, bulk_x=0, bulk_y=0)
+    local = homogenize(
+        HomogenizedBody.of_specimen(one, analytic(), free, divisions=(1, 1)), [0.08, 0.1]
+    )
+    assert local.critical is not None  # with plates that hold F̄ alone, the same for every n
+    first = local.critical.load, [state.force / (2 * PITCH) for state in local.states]
+    for n in REFERENCE:
+        both = [direct_strip(n, is_cut) for is_cut in (False, True)]
+        exact = np.mean([e for e, _ in both])
+        stress = np.mean([s for _, s in both], axis=0)
+        others = [homogenized_strip(n, rve) for rve in (analytic(), computed())] + [first]
+        strains = [f"{100 * e:.3f} ({e / exact - 1:+.1%})" for e, _ in others]
+        stresses = [", ".join(f"{x:+.1%}" for x in s / stress - 1) for _, s in others]
+        row(
+            n, f"{100 * exact:.3f} ({100 * both[0][0]:.3f}, {100 * both[1][0]:.3f})", *strains,
+            ", ".join(f"{s:.5f}" for s in stress), *stresses,
+            ", ".join(f"{e:.3f}" for e in REFERENCE[n]),
+        )  # fmt: skip
+
+
+def homogenized_specimen(
+    rve: RVE,
+    specimen: Specimen,
+    divisions: tuple[int, int] | None = None,
+    loads: tuple[float, ...] = (0.078, 0.128),
+    **options: object,
+) -> tuple[Homogenized, HomogenizedBody, float]:
+    loading = PlateLoading(**options)  # type: ignore[arg-type]
+    body = HomogenizedBody.of_specimen(specimen, rve, loading, divisions=divisions)
+    start = time.perf_counter()
+    found = homogenize(body, loads)
+    return found, body, time.perf_counter() - start
+
+
+def specimen_row(
+    name: str, found: Homogenized, count: object, seconds: float, exact: list[float]
+) -> None:
+    critical = found.critical.load if found.critical else np.nan
+    values = [critical, *(s.energy for s in found.states), *(s.force for s in found.states[-1:])]
+    if found.states[-1].branch == "primary":
+        values = values[:2]
+    texts = [f"{100 * critical:.3f} %", *(f"{v:.5f}" for v in values[1:])]
+    differences = [f"{t} ({v / e - 1:+.2%})" for t, v, e in zip(texts, values, exact, strict=False)]
+    unstable = found.states[-1].negative_eigenvalues
+    row(name, count, *differences, *[""] * (4 - len(differences)), unstable, f"{seconds:.0f}")
+
+
+def specimen() -> None:
+    head(
+        "6 x 10",
+        "RVEs",
+        "ε_c",
+        "energy at 7.8 % [N]",
+        "at 12.8 %",
+        "force [N/mm]",
+        "negative eigenvalues",
+        "s",
+    )
+    start = time.perf_counter()
+    direct = simulate(Experiment())
+    before, after = direct.at(0.078), direct.at(0.128)
+    exact = [direct.info["critical"]["strain"], before.energy, after.energy, after.reaction]
+    texts = [f"{100 * exact[0]:.3f} %", *(f"{v:.5f}" for v in exact[1:])]
+    row("direct", "", *texts, after.negative_pivots, f"{time.perf_counter() - start:.0f}")
+    for name, rve, parts, options in (
+        ("quarter", analytic(), (4, 4), {"quarter": True}),
+        ("quarter", analytic(), (6, 10), {"quarter": True}),
+        ("quarter", analytic(), (12, 20), {"quarter": True}),
+        ("quarter, Bloch φ", computed(), (6, 10), {"quarter": True}),
+        ("whole", analytic(), (3, 5), {}),
+        (
+            "first order, quarter",
+            RVE(supercell(), MATERIAL, [], JUNCTION),
+            (6, 10),
+            {"quarter": True},
+        ),
+    ):
+        found, body, seconds = homogenized_specimen(rve, Specimen(), parts, **options)
+        specimen_row(name, found, body.point_count, seconds, exact)
+
+
+def choices() -> None:
+    head("6 x 10, quarter, 24 RVEs", "ε_c", "change", "force at 12.8 % [N/mm]", "change")
+    reference: list[float] = []
+
+    def case(name: str, rves: RVE, **options: object) -> None:
+        found, _, _ = homogenized_specimen(
+            rves, Specimen(), (4, 6), (0.128,), quarter=True, **options
+        )
+        e = found.critical.load if found.critical else np.nan
+        force = found.states[-1].force if found.states else np.nan
+        reference[:] = reference or [e, force]
+        changes = [f"{v / r - 1:+.2%}" for v, r in zip((e, force), reference, strict=True)]
+        row(name, f"{e:.3%}", changes[0], f"{force:.4f}", changes[1])
+
+    case("as above", analytic())
+    case("centre on a hole", analytic(HOLE))
+    case("v free at bulk", analytic(), pattern_at_bulk="free")
+    case("Bloch φ", computed())
+    sine = PATTERN.sine
+    for name, change in (
+        ("φ_x up by 10 %", PlaneWaves(PATTERN.vectors, PATTERN.cosine, sine * [1.1, 1.0])),
+        (
+            "second wave up by 2 %",
+            PlaneWaves(PATTERN.vectors, PATTERN.cosine, sine * [[1.0], [1.02]]),
+        ),
+        ("phases moved by l/20", PATTERN.moved((0.05 * PITCH, 0.05 * PITCH))),
+    ):
+        case(name, RVE(supercell(), MATERIAL, [change], JUNCTION))
+
+
+def cost() -> None:
+    head(
+        "RVEs",
+        "macroscopic unknowns",
+        "ms a linearisation and RVE",
+        "peak memory [MB]",
+        "kB an RVE",
+    )
+    loading, before = PlateLoading(), 0.0
+    for parts in ((3, 5), (6, 10), (12, 20), (25, 40), (50, 50)):
+        body = HomogenizedBody.of_specimen(Specimen(), analytic(), loading, divisions=parts)
+        value = body.start
+        value[: body.free_count][body.is_pattern] = 0.01
+        start = time.process_time()
+        LinearisedBody(body, 0.01, value)
+        seconds, count = time.process_time() - start, body.point_count
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        row(
+            count,
+            body.free_count,
+            f"{1e3 * seconds / count:.2f}",
+            f"{peak:.0f}",
+            f"{1024 * (peak - before) / count:.0f}" if before else "",
+        )
+        before = before or peak
+
+
+SECTIONS: dict[str, Callable[[], None]] = {
+    "cell": cell, "strips": strips, "specimen": specimen, "choices": choices, "cost": cost,
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("section", nargs="*", help=", ".join(SECTIONS))
+    for name in parser.parse_args().section or SECTIONS:
+        SECTIONS[name]()
+
+
+if __name__ == "__main__":
+    main()
