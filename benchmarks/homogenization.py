@@ -158,7 +158,8 @@ def homogenized_strip(cells: int, rve: RVE) -> tuple[float, list[float]]:
 def strips() -> None:
     head(
         "cells", "direct ε_c [%]", "analytic φ", "Bloch φ", "first order",
-        "direct stress at 8, 10 % [MPa]", "analytic φ", "Bloch φ", "first order", "independent: direct, analytic φ",
+        "direct stress at 8, 10 % [MPa]", "analytic φ", "Bloch φ", "first order",
+        "independent: direct, analytic φ",
     )  # fmt: skip
     free = PlateLoading(sides="periodic", pattern_at_plates="free")
     one = Specimen(2, 2, bulk_x=0, bulk_y=0)
