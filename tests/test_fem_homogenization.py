@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from test_fem_simulate import PATIENT
 
 from modeharvest.fem.bloch.critical import first_critical
 from modeharvest.fem.bloch.postbuckling import follow
 from modeharvest.fem.bloch.real_modes import real_modes
+from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
-from modeharvest.fem.lattice.cells import UnitCell, square
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
 from modeharvest.fem.lattice.micromorphic.elements import rectangle_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
-from modeharvest.fem.lattice.micromorphic.path import Homogenized, homogenize
+from modeharvest.fem.lattice.micromorphic.path import (
+    Homogenized,
+    HomogenizedPath,
+    homogenize,
+    ranked_branches,
+)
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern, snapped
 from modeharvest.fem.lattice.micromorphic.rve import RVE, centred_cell
 from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxial, uniaxial_strain
-from modeharvest.fem.materials import Ogden
+from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.errors import InputError
 
@@ -183,6 +193,109 @@ def test_a_strip_between_plates_buckles_as_an_independent_calculation_found() ->
     assert found.critical.load == pytest.approx(0.05948, rel=5e-4)
     assert found.states[0].branch == "buckled"
     assert found.states[0].negative_eigenvalues == 0
+
+
+def test_three_degenerate_modes_make_a_flower() -> None:
+    """As on the branches of the periodic cell (docs/modes.md), with the energies of these."""
+    lattice, material = hexagonal(1.386, 1.28, 1.386 / 4), TwoTermI1()
+    primitive = PeriodicCell(lattice, material)
+    loading = MacroLoading(((-1.0, 0.0), (0.0, -1.0)))
+    critical = first_critical(CellPath(primitive, loading), CriticalSearch(divisions=2))
+    modes = real_modes(primitive, critical.state, critical.waves)
+    assert len(modes.shapes) == 3
+    four = UnitCell(modes.mesh, modes.lattice)
+    element = RVE(four, material, list(modes.shapes), (0.0, 0.0))
+    pressed = PlateLoading(sides="periodic", lateral=1.0, pattern_at_plates="free")
+    body = HomogenizedBody(rectangle_mesh([0, 1], [0, 1]), element, pressed)
+    path = HomogenizedPath(body, PathOptions(first_step=0.006, largest_step=0.006))
+    path.follow_primary(0.02, "all")
+    found = path.critical()
+    assert found is not None
+    assert (found.kind, len(found.modes), found.negative_after) == ("pattern", 3, 3)
+    assert found.load == pytest.approx(modes.load, rel=1e-6)
+    ranked = ranked_branches(path, found, 1.2 * found.load)
+    waves = [sum(v != 0 for v in pattern) for pattern, _ in ranked]
+    assert waves == 4 * [3] + 6 * [2] + 3 * [1]
+    cell_path = CellPath(PeriodicCell(four, material), loading)
+    for at, combination, negative in ((0, (1, 1, 1), 0), (4, (0, 1, 1), 1), (12, (0, 0, 1), 2)):
+        branch = follow(cell_path, modes, combination, [1.2 * found.load])
+        assert ranked[at][1].energy == pytest.approx(branch.states[0].energy, rel=1e-8)
+        assert ranked[at][1].negative_eigenvalues == negative
+
+
+def test_a_quarter_is_as_the_whole_on_the_primary_path() -> None:
+    quarter, whole = (
+        homogenize(
+            HomogenizedBody.of_specimen(
+                Specimen(4, 4), rve(), PlateLoading(quarter=is_quarter), divisions=(2, 2)
+            ),
+            [0.05],
+        ).states[0]
+        for is_quarter in (True, False)
+    )
+    assert quarter.energy == pytest.approx(whole.energy, rel=1e-10)
+    assert quarter.force == pytest.approx(whole.force, rel=1e-10)
+    assert np.isnan(whole.amplitudes).any()  # in the bulk
+
+
+def test_a_plate_s_force_is_the_derivative_of_the_energy() -> None:
+    """In bending, shear and compression, on the buckled branch too."""
+    for loading in (PlateLoading(), PlateLoading(0, 1), PlateLoading(0.5, 0, 1, plates="sliding")):
+        body = lattice_body(rve(), loading, holes=4, parts=2)
+        path, step = HomogenizedPath(body), 1e-4
+        loads = [0.03 - step, 0.03 + step, 0.03]
+        assert path.follow_primary(0.03)
+        below, above, at = (path.equilibrium(e, path.states[-1].value) for e in loads)
+        assert below is not None
+        assert above is not None
+        assert at is not None
+        slope = (above.energy - below.energy) / (2 * step)
+        assert at.force * body.length == pytest.approx(slope, rel=1e-6)
+        assert at.negative_eigenvalues == 0
+
+
+def test_positions_of_the_rve_are_averaged() -> None:
+    """A pitch further the mode has the other sign; the mean is about neither."""
+    there = RVE(cell(), Ogden(), [PATTERN], (0.95 + PITCH, 0.95))
+    specimen = Specimen(2, 2, bulk_x=0.0, bulk_y=0.0)
+    both = HomogenizedBody.of_specimen(specimen, [rve(), there], HELD, divisions=(1, 1))
+    found = homogenize(both, [0.06])
+    assert found.critical is not None
+    assert found.critical.load == pytest.approx(bloch_critical(uniaxial_strain()), rel=1e-6)
+    state = found.states[0]
+    u, moved = (both.microstructure(state.value, state.strains, k) for k in (0, 1))
+    v = state.strains[0, 4]
+    assert abs(v) > 0.05
+    for element, displacement in ((rve(), u), (there, moved)):
+        X = element.cell.cell.mesh.nodes
+        fluctuation = displacement - X @ (state.strains[0, :4].reshape(2, 2) - np.eye(2)).T
+        mass, phi = element.cell.nodal_mass, element.shapes[0].ravel()
+        mean = phi @ (mass @ fluctuation.ravel()) / (0.5 * mass.sum())
+        assert mean == pytest.approx(v, rel=1e-9)
+
+
+PARALLEL = """
+from mpi4py import MPI
+from test_fem_homogenization import LOOSE, homogenize, lattice_body, rve
+found = homogenize(lattice_body(rve(), LOOSE), [0.08])
+assert MPI.COMM_WORLD.size == 2
+if MPI.COMM_WORLD.rank == 0:
+    print(repr(float(found.critical.load)), repr(found.states[0].energy))
+"""
+
+
+def test_two_ranks_find_what_one_does() -> None:
+    alone = homogenize(lattice_body(rve(), LOOSE), [0.08])
+    command = ["mpirun", "-n", "2", sys.executable, "-c", PARALLEL]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=600, env=PATIENT, check=False,
+        cwd=Path(__file__).parent,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    load, energy = map(float, done.stdout.split())
+    assert alone.critical is not None
+    assert load == pytest.approx(alone.critical.load, rel=1e-9)
+    assert energy == pytest.approx(alone.states[0].energy, rel=1e-9)
 
 
 def test_an_rve_cut_about_a_point_is_the_same_lattice() -> None:

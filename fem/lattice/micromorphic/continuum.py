@@ -123,6 +123,21 @@ class HomogenizedBody:
         """The undeformed state: y, then w of this rank's RVEs one after the other."""
         return np.zeros(self.offsets[-1])
 
+    @property
+    def places(self) -> FloatArray:
+        """(points, 2) of the lattice's quadrature points [mm]."""
+        return self.regions[0].at.places.reshape(-1, 2)
+
+    def microstructure(self, value: FloatArray, strains: FloatArray, number: int) -> FloatArray:
+        """(n, 2) displacement [mm] of the nodes of an RVE's cell in a state; on every rank.
+
+        ``value`` and ``strains`` are the state's, ``number`` point times RVEs a point plus which.
+        """
+        owner, at = number % self.comm.size, number // self.comm.size
+        own = self.fluctuations(value)[at] if owner == self.comm.rank else None
+        w = self.comm.bcast(own, owner)
+        return self.rve(number).displacement(strains[number // len(self.rves)], w)
+
     def fluctuations(self, value: FloatArray) -> list[FloatArray]:
         """w of this rank's RVEs in a state."""
         return np.split(value, self.offsets[:-1])[1:]
@@ -180,14 +195,11 @@ class HomogenizedBody:
         on = [np.abs(nodes - edge) < near for edge in (low, high)]
         plates, sides = [e[:, 0] for e in on], [e[:, 1] for e in on]
         held, direction = np.zeros(self.size, bool), np.zeros(self.size)
+        direction[self._u_dofs[:, 1]] = -loading.lateral * (nodes[:, 1] - 0.5 * (low + high)[1])
         if loading.quarter:
-            mirrors, plates[0], sides[0] = (
-                (plates[0], sides[0]),
-                np.zeros(len(nodes), bool),
-                sides[1],
-            )
-            for axis, mirror in enumerate(mirrors):
+            for axis, mirror in enumerate((plates[0], sides[0])):
                 held[self._u_dofs[mirror, axis]] = True
+            plates[0] = np.zeros(len(nodes), bool)
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
         for sign, plate in zip((1.0, -1.0), plates, strict=True):
             y = (nodes[plate, 1] - middle[1]) / half[1]
@@ -196,7 +208,7 @@ class HomogenizedBody:
             direction[self._u_dofs[plate, 0]] = 0.5 * sign * self.length * push
             if loading.plates == "clamped":
                 held[self._u_dofs[plate, 1]] = True
-                direction[self._u_dofs[plate, 1]] = -0.5 * sign * self.length * loading.shear
+                direction[self._u_dofs[plate, 1]] -= 0.5 * sign * self.length * loading.shear
         if loading.plates == "sliding" and loading.sides != "guided":
             left = np.flatnonzero(plates[0])
             held[self._u_dofs[left[np.argmin(np.abs(nodes[left, 1] - middle[1]))], 1]] = True
@@ -221,14 +233,16 @@ class HomogenizedBody:
             has_v = self._v_dofs[upper] >= 0
             follows[self._v_dofs[upper][has_v]] = self._v_dofs[lower][has_v]
         self._require_support(held, follows)
-        self.direction: FloatArray = direction
-        """(size,) derivatives of all unknowns by the load."""
         own = np.flatnonzero(~held & (follows == np.arange(self.size)))
         self.free_count = len(own)
         numbers = np.full(self.size, -1)
         numbers[own] = np.arange(len(own))
         self.place: IntArray = np.where(held, -1, numbers[follows])
         """(size,) number of the free unknown that each unknown is, -1 where it is prescribed."""
+        self.direction: FloatArray = np.where(
+            self.place < 0, direction, direction - direction[follows]
+        )
+        """(size,) derivatives of all unknowns by the load, y fixed."""
         self.is_pattern = own >= 2 * len(nodes)
         """(free_count,) which of y are amplitudes v."""
 
@@ -264,6 +278,13 @@ class HomogenizedBody:
     def expand(self, y: FloatArray) -> FloatArray:
         """(size,) all unknowns, those of the load 0, from y."""
         return np.where(self.place >= 0, np.append(y, 0.0)[self.place], 0.0)
+
+    def picked(self, values: FloatArray) -> FloatArray:
+        """(free_count,) y from values of all unknowns."""
+        y = np.zeros(self.free_count)
+        free = self.place >= 0
+        y[self.place[free]] = values[free]
+        return y
 
     def restrict(self, forces: FloatArray) -> FloatArray:
         """(free_count,) forces on y of forces on all unknowns."""

@@ -15,21 +15,23 @@ PATTERN = ("zero", "free")
 
 @dataclass(frozen=True)
 class PlateLoading:
-    """Two rigid plates at the edges of least and largest x, moved in proportion to the load e.
+    """Two plates at the edges of least and largest x, moved in proportion to the load e.
 
     At x = +-a they have u_x = -+ e L (compression + bending y / b) / 2 and u_y = +- e L shear / 2
-    with b half the height: e is the nominal strain of ``compression = 1``, the mean shear of
-    ``shear = 1``, and the nominal strain of the uppermost fibre of ``bending = 1`` (small turns).
+    - e lateral y, with b half the height: e is the nominal strain of ``compression = 1``, the mean
+    shear of ``shear = 1``, the nominal strain of the uppermost fibre of ``bending = 1`` (small
+    turns), and with ``lateral = 1`` the nominal strain across, too, for sides that aren't free.
     """
 
     compression: float = 1.0
     shear: float = 0.0
     bending: float = 0.0
+    lateral: float = 0.0
     plates: str = "clamped"
     """With "sliding", u_y is free on the plates but for one node, which keeps the body there."""
     sides: str = "free"
-    """The edges of least and largest y: "free"; "periodic" with F̄_22 = 1 in the mean: all fields
-    are alike on both; "guided": u_y = 0."""
+    """The edges of least and largest y: "free"; "periodic": v is alike on both, and u but for the
+    lateral strain; "guided": u_y = - e lateral y."""
     pattern_at_plates: str = "zero"
     pattern_at_bulk: str = "zero"
     """Whether v is 0 where the lattice meets a plate, and where it meets solid bulk, or "free":
@@ -40,7 +42,7 @@ class PlateLoading:
 
     def __post_init__(self) -> None:
         require_edges(self.plates)
-        rates = self.compression, self.shear, self.bending
+        rates = self.compression, self.shear, self.bending, self.lateral
         if not np.isfinite(rates).all() or not any(rates):
             raise InputError(f"plates: expected finite rates, one of them not 0, got {rates}")
         if self.shear and self.plates != "clamped":
@@ -51,6 +53,8 @@ class PlateLoading:
             raise InputError(f"sides: expected one of {SIDES}, got {self.sides!r}")
         if self.bending and self.sides == "periodic":
             raise InputError("sides: expected 'free' or 'guided' ones in bending, got 'periodic'")
+        if self.lateral and self.sides == "free":
+            raise InputError("sides: expected 'periodic' or 'guided' ones with lateral, got 'free'")
         for name in ("pattern_at_plates", "pattern_at_bulk"):
             if getattr(self, name) not in PATTERN:
                 raise InputError(f"{name}: expected one of {PATTERN}, got {getattr(self, name)!r}")

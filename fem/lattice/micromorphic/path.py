@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 from scipy.linalg import eigh
@@ -38,7 +39,8 @@ _ITERATIONS = 8
 _SMALL = 1e-7
 _DENSE = 1000  # unknowns up to which all eigenvalues are computed
 _FEW = 6  # eigenvalues otherwise
-_ALIKE = 1e-4  # critical modes have eigenvalues that far from the lowest one's [-]
+_ALIKE = 1e-6  # critical modes have eigenvalues that far from the lowest one's [-]
+_NONE: FloatArray = np.zeros((0, 0))
 _SOME = 0.01  # of u: what a mode has at least of the pattern, if that is what becomes unstable
 _FARTHEST = 0.5  # of the pitch: the largest amplitude of a branch
 
@@ -203,18 +205,15 @@ class HomogenizedPath:
 
     def _pattern_negative(self, stiffness: csr_array) -> int:
         chosen = np.flatnonzero(self.body.is_pattern)
-        if not len(chosen):
-            return 0
-        return factorise(
-            stiffness[chosen][:, chosen].sorted_indices(), definite=False
-        ).negative_pivots
+        K = stiffness[chosen][:, chosen].sorted_indices()
+        return factorise(K, definite=False).negative_pivots if len(chosen) else 0
 
     def follow_primary(self, load: float, block: str = "") -> bool:
         """Extend ``states`` to a load, or to the first state where a block is unstable.
 
         False where no step, down to 1e-5, converges.
 
-        block : one of ``BLOCKS``; by default it doesn't matter.
+        block : "all", or "pattern" for v alone; by default stability doesn't matter.
         """
         step = self.options.first_step
         while (here := self.states[-1]).load < load - 1e-12 and not _is_unstable(here, block):
@@ -237,8 +236,7 @@ class HomogenizedPath:
         ones of the RVEs changes, proved by the inertia at both sides.
         """
         tolerance, ends = self.options.critical_tolerance, self.states[-2:]
-        known, rve_negative = {state.load: state for state in ends}, ends[0].rve_negative
-        is_rve = block == "all" and ends[1].rve_negative > rve_negative
+        known, calm = {state.load: state for state in ends}, ends[0].rve_negative
 
         def at(load: float) -> HomogenizedState:
             # Not from states so near to a singular one that rounding moves their v.
@@ -250,44 +248,36 @@ class HomogenizedPath:
             known[load] = found
             return found
 
-        def rve_sign(load: float) -> float:
-            return -1.0 if at(load).rve_negative > rve_negative else 1.0
-
-        def located(part: str) -> tuple[float, HomogenizedState, HomogenizedState] | None:
-            """By the lowest eigenvalue of a part, if inertia proves it the block's."""
-            a, b, accuracy = ends[0].load, ends[1].load, 0.2 * tolerance
-            try:
-                if is_rve:
-                    load = float(bisect(rve_sign, a, b, xtol=accuracy))
-                else:
-                    load = float(
-                        brentq(lambda load: self._lowest(part, at(load)), a, b, xtol=accuracy)
-                    )
-                after, before = at(load + tolerance), at(load - tolerance)
-            except (ArithmeticError, ValueError):  # ValueError: no change of sign
-                return None
-            proved = _is_unstable(after, block) and not _is_unstable(before, block)
-            return (load, before, after) if proved else None
+        def measure(load: float, part: str) -> float:
+            state = at(load)
+            if part == "RVE":
+                return -1.0 if state.rve_negative > calm else 1.0
+            return float(self._eigenpairs(part)[0][0])
 
         # The block of v alone first: its eigenvalue is smooth where modes of u are lower.
-        found = located("pattern") if ends[1].pattern_negative and not is_rve else None
-        found = found or located(block)
-        if found is None:
-            return None
-        load, before, after = found
-        modes: FloatArray = np.zeros((0, self.body.free_count))
-        kind = "RVE"
-        if not is_rve:
-            values, vectors = self._eigenpairs(block)
-            modes = vectors[:, np.abs(values - values[0]) < _ALIKE].T
-            peaks = np.array([self._largest(mode) for mode in modes])
-            kind = "pattern" if peaks[0, 0] > _SOME * peaks[0, 1] else "displacement"
-            modes = modes / peaks[:, [0 if kind == "pattern" else 1]]
-        counts = (before.negative_eigenvalues, after.negative_eigenvalues)
-        return HomogenizedCritical(load, kind, before, modes, *counts)
+        parts = ["pattern", block] if ends[1].pattern_negative else [block]
+        if block == "all" and ends[1].rve_negative > calm:
+            parts = ["RVE"]
+        for part in parts:
+            find, between = bisect if part == "RVE" else brentq, [state.load for state in ends]
+            try:
+                load = float(find(measure, *between, (part,), xtol=0.2 * tolerance))
+                after, before = at(load + tolerance), at(load - tolerance)
+            except (ArithmeticError, ValueError):  # ValueError: no change of sign
+                continue
+            if _is_unstable(after, block) and not _is_unstable(before, block):
+                modes, kind = self._critical_modes(block) if part != "RVE" else (_NONE, part)
+                counts = before.negative_eigenvalues, after.negative_eigenvalues
+                return HomogenizedCritical(load, kind, before, modes, *counts)
+        return None
 
-    def _lowest(self, block: str, _state: HomogenizedState) -> float:
-        return float(self._eigenpairs(block)[0][0])
+    def _critical_modes(self, block: str) -> tuple[FloatArray, str]:
+        """(k, free unknowns) modes of the last state that belong together, and of what kind."""
+        values, vectors = self._eigenpairs(block)
+        modes = vectors[:, np.abs(values - values[0]) < _ALIKE].T
+        peaks = np.array([self._largest(mode) for mode in modes])
+        kind = "pattern" if peaks[0, 0] > _SOME * peaks[0, 1] else "displacement"
+        return modes / peaks[:, [int(kind != "pattern")]], kind
 
     def _eigenpairs(self, block: str) -> tuple[FloatArray, FloatArray]:
         """Eigenvalues [-], ascending, and vectors of the stiffness of y at the last state."""
@@ -314,23 +304,19 @@ class HomogenizedPath:
         self,
         critical: HomogenizedCritical,
         loads: Sequence[float],
-        combination: Sequence[float] = (1.0,),
+        pattern: Sequence[float] | None = None,
         progress: Progress = silent,
     ) -> tuple[list[HomogenizedState], str]:
-        """States on the branch along a combination of the critical modes, and how it ended.
+        """States on a branch that starts at a critical point, and how it ended.
 
         One for each of the ``loads``, ascending, or fewer. Amplitudes are prescribed and grow;
-        the load is found, so that a branch whose load falls is followed too.
+        the load is found, so that a branch whose load falls is followed too. It starts along the
+        critical mode, of several the combination, that is most like v = ``pattern`` (m,)
+        everywhere: all 1 unless given. The opposite is the other half of the branch.
         """
-        mix = np.zeros(len(critical.modes))
-        if len(combination) > len(mix) or not np.any(combination):
-            raise InputError(
-                f"branch: expected up to {len(mix)} coefficients of critical modes, not all 0, got "
-                f"{tuple(combination)}"
-            )
-        mix[: len(combination)] = combination
-        mode = mix @ critical.modes
-        mode /= self._largest(mode)[critical.kind != "pattern"]
+        if not len(critical.modes):
+            raise InputError("branch: expected a critical point of the body, got one of an RVE")
+        mode = self._combined(critical, pattern)
         weights = self._scale * mode / float(mode @ (self._scale * mode))
         start = self._start(critical, mode)
         points, found, name = [start], list[HomogenizedState](), "buckled"
@@ -367,6 +353,23 @@ class HomogenizedPath:
                 found.append(state)
                 progress(state.load, loads[-1], "buckled branch")
         return found, f"followed to the load {points[-1].load:.6g}"
+
+    def _combined(
+        self, critical: HomogenizedCritical, pattern: Sequence[float] | None
+    ) -> FloatArray:
+        """The combination of critical modes nearest to a pattern, of size 1 mm."""
+        count = self.body.mode_count
+        wanted = np.ones(count) if pattern is None else np.asarray(pattern, np.float64)
+        if wanted.shape != (count,) or not np.any(wanted):
+            raise InputError(f"branch: expected {count} amplitudes, not all 0, got {pattern}")
+        like = np.zeros(self.body.size)
+        like[2 * len(self.body.mesh.nodes) :].reshape(-1, count)[:] = wanted
+        modes = critical.modes
+        overlaps = modes @ (self._scale * self.body.picked(like))
+        mix = np.linalg.solve((modes * self._scale) @ modes.T, overlaps)
+        size = np.linalg.norm(mix)
+        mode = mix @ modes if size > _SOME * np.linalg.norm(wanted) else modes[0]
+        return np.asarray(mode / self._largest(mode)[critical.kind != "pattern"])
 
     def _start(self, critical: HomogenizedCritical, mode: FloatArray) -> BranchPoint:
         """The critical point, and the direction in which the branch leaves it."""
@@ -416,6 +419,21 @@ def homogenize(
             met.append(here)
             pending.pop(0)
     return ended(f"followed to the load {met[-1].load:.6g}")
+
+
+def ranked_branches(
+    path: HomogenizedPath, critical: HomogenizedCritical, load: float
+) -> list[tuple[tuple[float, ...], HomogenizedState]]:
+    """The branches of a critical point at a load, that of least energy first.
+
+    Those along single modes v_i and along sums of them with either sign, the first one positive,
+    each with its pattern; those that can't be followed are left out.
+    """
+    signs = product((0.0, 1.0, -1.0), repeat=path.body.mode_count)
+    patterns = [p for p in signs if next((x for x in p if x), 0.0) > 0]
+    found = [(p, path.follow_branch(critical, [load], p)[0]) for p in patterns]
+    met = [(pattern, states[0]) for pattern, states in found if states]
+    return sorted(met, key=lambda item: item[1].energy)
 
 
 def _expected(states: Sequence[HomogenizedState], load: float) -> FloatArray:
