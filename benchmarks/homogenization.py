@@ -34,9 +34,9 @@ from modeharvest.fem.experiment import Experiment, PathOptions
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, square
+from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
-from modeharvest.fem.lattice.micromorphic.path import Homogenized, homogenize
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern
 from modeharvest.fem.lattice.micromorphic.rve import RVE
 from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxial, uniaxial_strain

@@ -20,15 +20,11 @@ from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize, ranked_branches
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
 from modeharvest.fem.lattice.micromorphic.elements import rectangle_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
-from modeharvest.fem.lattice.micromorphic.path import (
-    Homogenized,
-    HomogenizedPath,
-    homogenize,
-    ranked_branches,
-)
+from modeharvest.fem.lattice.micromorphic.path import HomogenizedPath
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern, snapped
 from modeharvest.fem.lattice.micromorphic.rve import RVE, centred_cell
 from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxial, uniaxial_strain

@@ -23,7 +23,7 @@ from modeharvest.fem.lattice.micromorphic.elements import Quadrature, quadrature
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.rve import RVE
 from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
-from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.fem.sparse_factor import factorise
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
@@ -87,7 +87,6 @@ class HomogenizedBody:
         if not lattice.all():
             self.regions.append(self._region(~lattice, points, 0))
         self._constrain(low, high)
-        self._find_entries()
         self.point_count = self.regions[0].at.weights.size
         count = self.point_count * len(self.rves)
         if comm.size > count:
@@ -96,7 +95,6 @@ class HomogenizedBody:
         """Numbers of this rank's RVEs: point times RVEs a point plus which of them."""
         sizes = [self.rve(k).cell.reduction.size for k in self.own]
         self.offsets = self.free_count + np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        self._factor: Factor | None = None
 
     @classmethod
     def of_specimen(
@@ -144,7 +142,7 @@ class HomogenizedBody:
 
     def unknowns(self, value: FloatArray, load: float) -> FloatArray:
         """All unknowns a of a state at a load."""
-        return self.expand(value[: self.free_count]) + load * self.direction
+        return np.asarray(self.T @ value[: self.free_count] + load * self.direction)
 
     def displacement(self, unknowns: FloatArray) -> FloatArray:
         """(n, 2) [mm]."""
@@ -232,69 +230,48 @@ class HomogenizedBody:
             follows[self._u_dofs[upper]] = self._u_dofs[lower]
             has_v = self._v_dofs[upper] >= 0
             follows[self._v_dofs[upper][has_v]] = self._v_dofs[lower][has_v]
-        self._require_support(held, follows)
         own = np.flatnonzero(~held & (follows == np.arange(self.size)))
-        self.free_count = len(own)
         numbers = np.full(self.size, -1)
         numbers[own] = np.arange(len(own))
-        self.place: IntArray = np.where(held, -1, numbers[follows])
-        """(size,) number of the free unknown that each unknown is, -1 where it is prescribed."""
-        self.direction: FloatArray = np.where(
-            self.place < 0, direction, direction - direction[follows]
-        )
+        place = np.where(held, -1, numbers[follows])
+        rows = np.flatnonzero(place >= 0)
+        self.T = csr_array((np.ones(len(rows)), (rows, place[rows])), (self.size, len(own)))
+        """(size, free_count): all unknowns are T y + load * direction."""
+        self.direction: FloatArray = np.where(place < 0, direction, direction - direction[follows])
         """(size,) derivatives of all unknowns by the load, y fixed."""
-        self.is_pattern = own >= 2 * len(nodes)
-        """(free_count,) which of y are amplitudes v."""
+        self.free_count, self.is_pattern = len(own), own >= 2 * len(nodes)
+        """Number of y, and which of them are amplitudes v."""
+        self._require_support()
 
     def _hold_pattern(self, held: BoolArray, where: BoolArray) -> None:
         dofs = self._v_dofs[where]
         held[dofs[dofs >= 0]] = True
 
-    def _require_support(self, held: BoolArray, follows: IntArray) -> None:
+    def _require_support(self) -> None:
         """No rigid motion may be left."""
-        X, count = self.mesh.nodes, 2 * len(self.mesh.nodes)
+        X, rigid = self.mesh.nodes, np.zeros((self.size, 3))
         X = (X - X.mean(axis=0)) / np.ptp(X, axis=0).max()
-        turn = np.stack([-X[:, 1], X[:, 0]], axis=1).ravel()
-        rigid = np.column_stack([np.tile([1.0, 0.0], len(X)), np.tile([0.0, 1.0], len(X)), turn])
-        rows = np.vstack([rigid[held[:count]], rigid[follows[:count]] - rigid])
-        if np.linalg.matrix_rank(rows, 1e-6) < 3:
+        rigid[self._u_dofs[:, 0], 0] = rigid[self._u_dofs[:, 1], 1] = 1.0
+        rigid[self._u_dofs.T, 2] = -X[:, 1], X[:, 0]
+        away = rigid - self.T @ self.picked(rigid)
+        if np.linalg.matrix_rank(away, 1e-6) < 3:
             raise InputError(
                 "homogenized body: expected supports that leave no rigid motion, got too few; "
                 "give plates more than one node, clamp them or guide the sides"
             )
 
-    def _find_entries(self) -> None:
-        """Where the entries of the elements' matrices go in the stiffness of y."""
-        rows, columns = [], []
-        for region in self.regions:
-            place = self.place[region.dofs]
-            row, column = np.broadcast_arrays(place[:, :, None], place[:, None, :])
-            rows.append(row.ravel())
-            columns.append(column.ravel())
-        entries = np.concatenate(rows), np.concatenate(columns)
-        self._kept = np.flatnonzero((entries[0] >= 0) & (entries[1] >= 0))
-        self._entries = entries[0][self._kept], entries[1][self._kept]
-
-    def expand(self, y: FloatArray) -> FloatArray:
-        """(size,) all unknowns, those of the load 0, from y."""
-        return np.where(self.place >= 0, np.append(y, 0.0)[self.place], 0.0)
-
     def picked(self, values: FloatArray) -> FloatArray:
-        """(free_count,) y from values of all unknowns."""
-        y = np.zeros(self.free_count)
-        free = self.place >= 0
-        y[self.place[free]] = values[free]
-        return y
-
-    def restrict(self, forces: FloatArray) -> FloatArray:
-        """(free_count,) forces on y of forces on all unknowns."""
-        free = self.place >= 0
-        return np.asarray(np.bincount(self.place[free], forces[free], self.free_count), np.float64)
+        """(free_count, ...) the y nearest to values of all unknowns (size, ...)."""
+        return np.asarray(((self.T.T @ values).T / self.T.sum(axis=0)).T)
 
     def matrix(self, element_matrices: Sequence[FloatArray]) -> csr_array:
         """The sparse matrix of y from those of the regions' elements (c, d, d)."""
-        values = np.concatenate([K.ravel() for K in element_matrices])[self._kept]
-        return csr_array((values, self._entries), (self.free_count,) * 2)
+        whole = csr_array((self.size, self.size))
+        for region, K in zip(self.regions, element_matrices, strict=True):
+            rows, columns = np.broadcast_arrays(region.dofs[:, :, None], region.dofs[:, None, :])
+            entries = K.ravel(), (rows.ravel(), columns.ravel())
+            whole = whole + csr_array(entries, whole.shape)
+        return csr_array(self.T.T @ whole @ self.T).sorted_indices()
 
     def summed(self, element_forces: Sequence[FloatArray]) -> FloatArray:
         """(size,) forces on all unknowns from those of the regions' elements (c, d)."""
@@ -302,14 +279,6 @@ class HomogenizedBody:
         for region, forces in zip(self.regions, element_forces, strict=True):
             total += np.bincount(region.dofs.ravel(), forces.ravel(), self.size)
         return total
-
-    def factor(self, matrix: csr_array) -> Factor:
-        """Factorise a stiffness of y, L D L^T; the same object again."""
-        if self._factor is None:
-            self._factor = factorise(matrix, definite=False)
-        else:
-            self._factor.update(matrix)
-        return self._factor
 
     def bulk_response(self, strains: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Energy density (p,), P (p, 4) and moduli (p, 4, 4) [MPa] of the bulk at F̄ (p, 4)."""
@@ -366,13 +335,13 @@ class LinearisedBody:
             matrices.append(K)
             along.append(np.einsum("cde,ce->cd", K, body.direction[region.dofs]))
         self.forces = body.summed(forces)
-        self.residual = body.restrict(self.forces)
+        self.residual = body.T.T @ self.forces
         self.along_load = body.summed(along)
-        self.load_force = body.restrict(self.along_load)
+        self.load_force = body.T.T @ self.along_load
         self.load_size = float(np.linalg.norm(self.along_load))
         self.stiffness = body.matrix(matrices)
         try:
-            factor = body.factor(self.stiffness)
+            factor = factorise(self.stiffness, definite=False)
         except ArithmeticError:
             self.is_regular = False
             return
@@ -407,7 +376,7 @@ class LinearisedBody:
     def moved(self, dy: FloatArray, change: float, relax: bool = True) -> FloatArray:
         """Change of the whole state by that of y and of the load; RVEs go into equilibrium too."""
         body = self.body
-        da = body.expand(dy) + change * body.direction
+        da = body.T @ dy + change * body.direction
         dq = np.einsum("cpsd,cd->cps", body.regions[0].B, da[body.regions[0].dofs])
         dq = dq.reshape(body.point_count, -1)
         parts = [dy]

@@ -1,8 +1,7 @@
-"""Equilibrium paths of a homogenized body: primary path, critical point, buckled branch.
+"""Equilibria of a homogenized body: primary path, stability, critical point.
 
 Newton's method goes for both scales at once; RVEs start from their own last states, carried
-along with F̄, v and g by cubics. A body that has its lattice's symmetry keeps v = 0 for ever, so the
-branch is entered by its amplitude. Stability is by the inertia of L D L^T factors: of all RVEs at
+along with F̄, v and g by cubics. Stability is by the inertia of L D L^T factors: of all RVEs at
 fixed strains and of the body's condensed stiffness (their sum, Haynsworth, Linear Algebra Appl. 1
 (1968) 73-81), and of the block of v alone, which no soft mode of u can hide.
 """
@@ -11,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import product
 
 import numpy as np
 from scipy.linalg import eigh
@@ -21,17 +19,10 @@ from scipy.sparse.linalg import eigsh
 
 from modeharvest.fem.experiment import SMALLEST_STEP, PathOptions
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
-from modeharvest.fem.path.continuation import (
-    BranchPoint,
-    amplitude_at,
-    extrapolate,
-    load_at,
-    value_at,
-)
+from modeharvest.fem.path.continuation import extrapolate
 from modeharvest.fem.sparse_factor import factorise
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.progress import Progress, silent
 
 _ITERATIONS = 8
 # What a change of the load by this makes: forces that one more Newton step turns into nothing, so
@@ -42,7 +33,6 @@ _FEW = 6  # eigenvalues otherwise
 _ALIKE = 1e-6  # critical modes have eigenvalues that far from the lowest one's [-]
 _NONE: FloatArray = np.zeros((0, 0))
 _SOME = 0.01  # of u: what a mode has at least of the pattern, if that is what becomes unstable
-_FARTHEST = 0.5  # of the pitch: the largest amplitude of a branch
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,26 +86,6 @@ class HomogenizedCritical:
     """Negative eigenvalues at either side, ``tolerance`` away: the proof."""
 
 
-@dataclass(frozen=True, eq=False)
-class Homogenized:
-    """What a homogenized specimen does under load."""
-
-    states: tuple[HomogenizedState, ...]
-    """At the loads asked for, ascending; buckled beyond the critical point."""
-    criticals: tuple[HomogenizedCritical, ...]
-    """Those passed on the primary path; the branch starts at the last one."""
-    outcome: str
-    """How far it was followed, and why no farther."""
-    linearisations: int
-    """Of the whole body: as many factorisations of every RVE."""
-
-    @property
-    def critical(self) -> HomogenizedCritical | None:
-        """Where the pattern starts to grow, or without modes the first RVE becomes unstable."""
-        found = [c for c in self.criticals if c.kind != "displacement"]
-        return found[0] if found else None
-
-
 class HomogenizedPath:
     """Equilibria of one body; the linearisation at the last one serves what is next.
 
@@ -134,7 +104,7 @@ class HomogenizedPath:
         self.states = [start]
         """The primary path."""
         # A metric that makes eigenvalues of u and v comparable numbers.
-        self._scale = np.abs(self.last.stiffness.diagonal())
+        self.scale = np.abs(self.last.stiffness.diagonal())
 
     def equilibrium(
         self,
@@ -216,7 +186,7 @@ class HomogenizedPath:
         block : "all", or "pattern" for v alone; by default stability doesn't matter.
         """
         step = self.options.first_step
-        while (here := self.states[-1]).load < load - 1e-12 and not _is_unstable(here, block):
+        while (here := self.states[-1]).load < load - 1e-12 and not is_unstable(here, block):
             pieces = max(1, int(np.ceil((load - here.load) / step - 0.1)))
             to = load if pieces == 1 else here.load + (load - here.load) / pieces
             found = self.equilibrium(to, _expected(self.states, to))
@@ -265,7 +235,7 @@ class HomogenizedPath:
                 after, before = at(load + tolerance), at(load - tolerance)
             except (ArithmeticError, ValueError):  # ValueError: no change of sign
                 continue
-            if _is_unstable(after, block) and not _is_unstable(before, block):
+            if is_unstable(after, block) and not is_unstable(before, block):
                 modes, kind = self._critical_modes(block) if part != "RVE" else (_NONE, part)
                 counts = before.negative_eigenvalues, after.negative_eigenvalues
                 return HomogenizedCritical(load, kind, before, modes, *counts)
@@ -275,14 +245,14 @@ class HomogenizedPath:
         """(k, free unknowns) modes of the last state that belong together, and of what kind."""
         values, vectors = self._eigenpairs(block)
         modes = vectors[:, np.abs(values - values[0]) < _ALIKE].T
-        peaks = np.array([self._largest(mode) for mode in modes])
+        peaks = np.array([self.largest(mode) for mode in modes])
         kind = "pattern" if peaks[0, 0] > _SOME * peaks[0, 1] else "displacement"
         return modes / peaks[:, [int(kind != "pattern")]], kind
 
     def _eigenpairs(self, block: str) -> tuple[FloatArray, FloatArray]:
         """Eigenvalues [-], ascending, and vectors of the stiffness of y at the last state."""
         chosen = np.flatnonzero(self.body.is_pattern | (block == "all"))
-        root = 1.0 / np.sqrt(self._scale[chosen])
+        root = 1.0 / np.sqrt(self.scale[chosen])
         K = self.last.stiffness[chosen][:, chosen] * root[:, None] * root
         if len(chosen) <= _DENSE:
             values, scaled = eigh(K.toarray())
@@ -293,147 +263,12 @@ class HomogenizedPath:
         vectors[chosen] = root[:, None] * scaled[:, order]
         return values[order], vectors
 
-    def _largest(self, mode: FloatArray) -> tuple[float, float]:
+    def largest(self, mode: FloatArray) -> tuple[float, float]:
         """The largest displacement by the pattern, sum |v_i| max |phi_i|, and that of u [mm]."""
         body = self.body
-        a, peaks = body.expand(mode), np.linalg.norm(body.rves[0].shapes, axis=2).max(axis=1)
+        a, peaks = body.T @ mode, np.linalg.norm(body.rves[0].shapes, axis=2).max(axis=1)
         pattern = np.nan_to_num(np.abs(body.amplitudes(a))) @ peaks
         return float(pattern.max()), float(np.linalg.norm(body.displacement(a), axis=1).max())
-
-    def follow_branch(
-        self,
-        critical: HomogenizedCritical,
-        loads: Sequence[float],
-        pattern: Sequence[float] | None = None,
-        progress: Progress = silent,
-    ) -> tuple[list[HomogenizedState], str]:
-        """States on a branch that starts at a critical point, and how it ended.
-
-        One for each of the ``loads``, ascending, or fewer. Amplitudes are prescribed and grow;
-        the load is found, so that a branch whose load falls is followed too. It starts along the
-        critical mode, of several the combination, that is most like v = ``pattern`` (m,)
-        everywhere: all 1 unless given. The opposite is the other half of the branch.
-        """
-        if not len(critical.modes):
-            raise InputError("branch: expected a critical point of the body, got one of an RVE")
-        mode = self._combined(critical, pattern)
-        weights = self._scale * mode / float(mode @ (self._scale * mode))
-        start = self._start(critical, mode)
-        points, found, name = [start], list[HomogenizedState](), "buckled"
-        origin = float(weights @ start.value[: self.body.free_count])
-        first = self.options.first_amplitude * self.pitch
-        reach = first
-        while len(found) < len(loads):
-            target, amplitude = loads[len(found)], reach
-            if reach > _FARTHEST * self.pitch:
-                return found, f"the pattern has grown to {_FARTHEST} of the pitch"
-            is_near = load_at(points, reach) >= target
-            if is_near:
-                before = points[-1] if points[-1].load < target else points[-2]
-                amplitude = amplitude_at(points, target, before.amplitude, reach)
-                state = self.equilibrium(target, value_at(points, amplitude), branch=name)
-            else:
-                guess = load_at(points, amplitude), value_at(points, amplitude)
-                state = self.equilibrium(*guess, weights, origin + amplitude, branch=name)
-            reached = -1.0
-            if state is not None:
-                reached = float(weights @ state.value[: self.body.free_count]) - origin
-            # Under a prescribed load Newton may fall back to the primary path.
-            if state is None or reached < 0.2 * amplitude:
-                reach = 0.5 * (points[-1].amplitude + amplitude)
-                if reach - points[-1].amplitude < 0.02 * first:
-                    return found, f"no equilibrium beyond the load {points[-1].load:.6g}"
-                continue
-            rate = float(weights @ state.rate[: self.body.free_count])
-            points.append(
-                BranchPoint(reached, state.load, 1 / rate, state.value, state.rate / rate)
-            )
-            reach = self.options.growth * reached
-            if is_near:
-                found.append(state)
-                progress(state.load, loads[-1], "buckled branch")
-        return found, f"followed to the load {points[-1].load:.6g}"
-
-    def _combined(
-        self, critical: HomogenizedCritical, pattern: Sequence[float] | None
-    ) -> FloatArray:
-        """The combination of critical modes nearest to a pattern, of size 1 mm."""
-        count = self.body.mode_count
-        wanted = np.ones(count) if pattern is None else np.asarray(pattern, np.float64)
-        if wanted.shape != (count,) or not np.any(wanted):
-            raise InputError(f"branch: expected {count} amplitudes, not all 0, got {pattern}")
-        like = np.zeros(self.body.size)
-        like[2 * len(self.body.mesh.nodes) :].reshape(-1, count)[:] = wanted
-        modes = critical.modes
-        overlaps = modes @ (self._scale * self.body.picked(like))
-        mix = np.linalg.solve((modes * self._scale) @ modes.T, overlaps)
-        size = np.linalg.norm(mix)
-        mode = mix @ modes if size > _SOME * np.linalg.norm(wanted) else modes[0]
-        return np.asarray(mode / self._largest(mode)[critical.kind != "pattern"])
-
-    def _start(self, critical: HomogenizedCritical, mode: FloatArray) -> BranchPoint:
-        """The critical point, and the direction in which the branch leaves it."""
-        state = critical.state
-        value = state.value + (critical.load - state.load) * state.rate
-        at = LinearisedBody(self.body, state.load, state.value)
-        return BranchPoint(0.0, critical.load, 0.0, value, at.moved(mode, 0.0, relax=False))
-
-
-def homogenize(
-    body: HomogenizedBody,
-    loads: Sequence[float],
-    options: PathOptions | None = None,
-    progress: Progress = silent,
-) -> Homogenized:
-    """States of a homogenized specimen at some loads [-], positive and ascending.
-
-    On the primary path up to the first critical point at which a pattern grows, then on the branch
-    that it makes. Critical points of u alone, before it, are kept in ``criticals`` and passed.
-    """
-    wanted = np.asarray(loads, dtype=np.float64)
-    if wanted.ndim != 1 or not len(wanted) or not (np.diff(wanted, prepend=0.0) > 0).all():
-        raise InputError(f"loads: expected ascending positive ones, got {list(loads)}")
-    path, met = HomogenizedPath(body, options), list[HomogenizedState]()
-    criticals: list[HomogenizedCritical] = []
-    block, pending = "all", list(wanted)
-
-    def ended(outcome: str) -> Homogenized:
-        return Homogenized(tuple(met), tuple(criticals), outcome, path.linearisations)
-
-    while pending:
-        if not path.follow_primary(pending[0], block):
-            return ended(f"no equilibrium of the primary path beyond {path.states[-1].load:.6g}")
-        here = path.states[-1]
-        progress(here.load, wanted[-1], "primary path")
-        if _is_unstable(here, block):
-            found = path.critical(block)
-            if found is None:
-                return ended(f"the critical point below the load {here.load:.6g} got lost")
-            criticals.append(found)
-            if found.kind == "pattern":
-                states, outcome = path.follow_branch(found, pending, progress=progress)
-                met += states
-                return ended(outcome)
-            block = "pattern" if found.kind == "displacement" else ""
-        if here.load >= pending[0] - 1e-12:
-            met.append(here)
-            pending.pop(0)
-    return ended(f"followed to the load {met[-1].load:.6g}")
-
-
-def ranked_branches(
-    path: HomogenizedPath, critical: HomogenizedCritical, load: float
-) -> list[tuple[tuple[float, ...], HomogenizedState]]:
-    """The branches of a critical point at a load, that of least energy first.
-
-    Those along single modes v_i and along sums of them with either sign, the first one positive,
-    each with its pattern; those that can't be followed are left out.
-    """
-    signs = product((0.0, 1.0, -1.0), repeat=path.body.mode_count)
-    patterns = [p for p in signs if next((x for x in p if x), 0.0) > 0]
-    found = [(p, path.follow_branch(critical, [load], p)[0]) for p in patterns]
-    met = [(pattern, states[0]) for pattern, states in found if states]
-    return sorted(met, key=lambda item: item[1].energy)
 
 
 def _expected(states: Sequence[HomogenizedState], load: float) -> FloatArray:
@@ -441,7 +276,7 @@ def _expected(states: Sequence[HomogenizedState], load: float) -> FloatArray:
     return np.asarray(extrapolate([(s.load, s.value, s.rate) for s in states[-2:]], load))
 
 
-def _is_unstable(state: HomogenizedState, block: str) -> bool:
+def is_unstable(state: HomogenizedState, block: str) -> bool:
     """Whether a block ("all", "pattern", or none) has a negative eigenvalue."""
     counts = {"all": state.negative_eigenvalues, "pattern": state.pattern_negative, "": 0}
     return counts[block] > 0

@@ -1,0 +1,187 @@
+"""What a homogenized specimen does under load: primary path, critical point, buckled branches.
+
+A body that has its lattice's symmetry keeps v = 0 for ever, so a branch is entered by its
+amplitude: that is prescribed, and the load is found, which is regular at the critical point and
+where the load has a maximum or minimum. States at given loads are then met exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from modeharvest.fem.experiment import PathOptions
+from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
+from modeharvest.fem.lattice.micromorphic.path import (
+    HomogenizedCritical,
+    HomogenizedPath,
+    HomogenizedState,
+    is_unstable,
+)
+from modeharvest.fem.path.continuation import BranchPoint, amplitude_at, load_at, value_at
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+
+_FARTHEST = 0.5  # of the pitch: the largest amplitude of a branch
+_SHORTEST = 0.02  # of the first amplitude: the smallest step
+_LIKE = 0.01  # overlap of a critical mode with a pattern below which there is none
+
+
+@dataclass(frozen=True, eq=False)
+class Homogenized:
+    """What a homogenized specimen does under load."""
+
+    states: tuple[HomogenizedState, ...]
+    """At the loads asked for, ascending; buckled beyond the critical point."""
+    criticals: tuple[HomogenizedCritical, ...]
+    """Those passed on the primary path; the branch starts at the last one."""
+    outcome: str
+    """How far it was followed, and why no farther."""
+    linearisations: int
+    """Of the whole body: as many factorisations of every RVE."""
+
+    @property
+    def critical(self) -> HomogenizedCritical | None:
+        """Where the pattern starts to grow, or without modes the first RVE becomes unstable."""
+        found = [c for c in self.criticals if c.kind != "displacement"]
+        return found[0] if found else None
+
+
+def homogenize(
+    body: HomogenizedBody,
+    loads: Sequence[float],
+    options: PathOptions | None = None,
+    progress: Progress = silent,
+) -> Homogenized:
+    """States of a homogenized specimen at some loads [-], positive and ascending.
+
+    On the primary path up to the first critical point at which a pattern grows, then on the branch
+    that it makes. Critical points of u alone, before it, are kept in ``criticals`` and passed.
+    """
+    wanted = np.asarray(loads, dtype=np.float64)
+    if wanted.ndim != 1 or not len(wanted) or not (np.diff(wanted, prepend=0.0) > 0).all():
+        raise InputError(f"loads: expected ascending positive ones, got {list(loads)}")
+    path, met = HomogenizedPath(body, options), list[HomogenizedState]()
+    criticals: list[HomogenizedCritical] = []
+    block, pending = "all", list(wanted)
+
+    def ended(outcome: str) -> Homogenized:
+        return Homogenized(tuple(met), tuple(criticals), outcome, path.linearisations)
+
+    while pending:
+        if not path.follow_primary(pending[0], block):
+            return ended(f"no equilibrium of the primary path beyond {path.states[-1].load:.6g}")
+        here = path.states[-1]
+        progress(here.load, wanted[-1], "primary path")
+        if is_unstable(here, block):
+            found = path.critical(block)
+            if found is None:
+                return ended(f"the critical point below the load {here.load:.6g} got lost")
+            criticals.append(found)
+            if found.kind == "pattern":
+                states, outcome = follow_branch(path, found, pending, progress=progress)
+                met += states
+                return ended(outcome)
+            block = "pattern" if found.kind == "displacement" else ""
+        if here.load >= pending[0] - 1e-12:
+            met.append(here)
+            pending.pop(0)
+    return ended(f"followed to the load {met[-1].load:.6g}")
+
+
+def follow_branch(
+    path: HomogenizedPath,
+    critical: HomogenizedCritical,
+    loads: Sequence[float],
+    pattern: Sequence[float] | None = None,
+    progress: Progress = silent,
+) -> tuple[list[HomogenizedState], str]:
+    """States on a branch that starts at a critical point, and how it ended.
+
+    One for each of the ``loads``, ascending, or fewer. Amplitudes are prescribed and grow;
+    the load is found, so that a branch whose load falls is followed too. It starts along the
+    critical mode, of several the combination, that is most like v = ``pattern`` (m,)
+    everywhere: all 1 unless given. The opposite is the other half of the branch.
+    """
+    if not len(critical.modes):
+        raise InputError("branch: expected a critical point of the body, got one of an RVE")
+    mode = _combined(path, critical, pattern)
+    weights = path.scale * mode / float(mode @ (path.scale * mode))
+    start = _start(path, critical, mode)
+    points, found, name = [start], list[HomogenizedState](), "buckled"
+    origin = float(weights @ start.value[: path.body.free_count])
+    first = path.options.first_amplitude * path.pitch
+    reach = first
+    while len(found) < len(loads):
+        target, amplitude = loads[len(found)], reach
+        if reach > _FARTHEST * path.pitch:
+            return found, f"the pattern has grown to {_FARTHEST} of the pitch"
+        is_near = load_at(points, reach) >= target
+        if is_near:
+            before = points[-1] if points[-1].load < target else points[-2]
+            amplitude = amplitude_at(points, target, before.amplitude, reach)
+            state = path.equilibrium(target, value_at(points, amplitude), branch=name)
+        else:
+            guess = load_at(points, amplitude), value_at(points, amplitude)
+            state = path.equilibrium(*guess, weights, origin + amplitude, branch=name)
+        reached = -1.0
+        if state is not None:
+            reached = float(weights @ state.value[: path.body.free_count]) - origin
+        # Under a prescribed load Newton may fall back to the primary path.
+        if state is None or reached < 0.2 * amplitude:
+            reach = 0.5 * (points[-1].amplitude + amplitude)
+            if reach - points[-1].amplitude < _SHORTEST * first:
+                return found, f"no equilibrium beyond the load {points[-1].load:.6g}"
+            continue
+        rate = float(weights @ state.rate[: path.body.free_count])
+        points.append(BranchPoint(reached, state.load, 1 / rate, state.value, state.rate / rate))
+        reach = path.options.growth * reached
+        if is_near:
+            found.append(state)
+            progress(state.load, loads[-1], "buckled branch")
+    return found, f"followed to the load {points[-1].load:.6g}"
+
+
+def _combined(
+    path: HomogenizedPath, critical: HomogenizedCritical, pattern: Sequence[float] | None
+) -> FloatArray:
+    """The combination of critical modes nearest to a pattern, of size 1 mm."""
+    count = path.body.mode_count
+    wanted = np.ones(count) if pattern is None else np.asarray(pattern, np.float64)
+    if wanted.shape != (count,) or not np.any(wanted):
+        raise InputError(f"branch: expected {count} amplitudes, not all 0, got {pattern}")
+    like = np.zeros(path.body.size)
+    like[2 * len(path.body.mesh.nodes) :].reshape(-1, count)[:] = wanted
+    modes = critical.modes
+    overlaps = modes @ (path.scale * path.body.picked(like))
+    mix = np.linalg.solve((modes * path.scale) @ modes.T, overlaps)
+    size = np.linalg.norm(mix)
+    mode = mix @ modes if size > _LIKE * np.linalg.norm(wanted) else modes[0]
+    return np.asarray(mode / path.largest(mode)[critical.kind != "pattern"])
+
+
+def _start(path: HomogenizedPath, critical: HomogenizedCritical, mode: FloatArray) -> BranchPoint:
+    """The critical point, and the direction in which the branch leaves it."""
+    state = critical.state
+    value = state.value + (critical.load - state.load) * state.rate
+    at = LinearisedBody(path.body, state.load, state.value)
+    return BranchPoint(0.0, critical.load, 0.0, value, at.moved(mode, 0.0, relax=False))
+
+
+def ranked_branches(
+    path: HomogenizedPath, critical: HomogenizedCritical, load: float
+) -> list[tuple[tuple[float, ...], HomogenizedState]]:
+    """The branches of a critical point at a load, that of least energy first.
+
+    Those along single modes v_i and along sums of them with either sign, the first one positive,
+    each with its pattern; those that can't be followed are left out.
+    """
+    signs = product((0.0, 1.0, -1.0), repeat=path.body.mode_count)
+    patterns = [p for p in signs if next((x for x in p if x), 0.0) > 0]
+    found = [(p, follow_branch(path, critical, [load], p)[0]) for p in patterns]
+    met = [(pattern, states[0]) for pattern, states in found if states]
+    return sorted(met, key=lambda item: item[1].energy)
