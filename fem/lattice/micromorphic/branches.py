@@ -154,8 +154,7 @@ def _combined(
     wanted = np.ones(count) if pattern is None else np.asarray(pattern, np.float64)
     if wanted.shape != (count,) or not np.any(wanted):
         raise InputError(f"branch: expected {count} amplitudes, not all 0, got {pattern}")
-    like = np.zeros(path.body.size)
-    like[2 * len(path.body.mesh.nodes) :].reshape(-1, count)[:] = wanted
+    like = np.tile([0.0, 0.0, *wanted], len(path.body.mesh.nodes))
     modes = critical.modes
     overlaps = modes @ (path.scale * path.body.picked(like))
     mix = np.linalg.solve((modes * path.scale) @ modes.T, overlaps)

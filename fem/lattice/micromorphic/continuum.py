@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -45,9 +45,8 @@ class HomogenizedBody:
     """A body of a homogenized lattice, perhaps with solid bulk, between two plates.
 
     Unknown are ``free_count`` numbers y; all unknowns a are those or follow the load. Nodal values
-    are ``displacement(a)`` (n, 2) [mm] and ``amplitudes(a)`` (n, m), NaN in bulk. An InputError
-    refuses RVEs with differing numbers of modes, supports that leave it loose, and more ranks
-    than RVEs.
+    are ``fields(a)``. An InputError refuses RVEs with differing numbers of modes, supports that
+    leave it loose, and more ranks than RVEs.
 
     mesh : T3, T6, Q4, Q8 or Q9 [mm].
     rves : one, or several that are averaged at every point.
@@ -82,7 +81,7 @@ class HomogenizedBody:
         self.copies = 4 if loading.quarter else 1
         """How many such bodies make up the whole."""
         self.length = float(length or (high - low)[0] * math.sqrt(self.copies))
-        self._number_unknowns()
+        self._lattice_nodes = np.unique(mesh.cells[lattice])
         self.regions = [self._region(lattice, points, self.mode_count)]
         if not lattice.all():
             self.regions.append(self._region(~lattice, points, 0))
@@ -144,17 +143,12 @@ class HomogenizedBody:
         """All unknowns a of a state at a load."""
         return np.asarray(self.T @ value[: self.free_count] + load * self.direction)
 
-    def displacement(self, unknowns: FloatArray) -> FloatArray:
-        """(n, 2) [mm]."""
-        return unknowns[: 2 * len(self.mesh.nodes)].reshape(-1, 2)
-
-    def amplitudes(self, unknowns: FloatArray) -> FloatArray:
-        """(n, m) v_i at the nodes; NaN where there is no lattice."""
-        values = np.full((len(self.mesh.nodes), self.mode_count), np.nan)
-        values[self._lattice_nodes] = unknowns[2 * len(values) :].reshape(
-            len(self._lattice_nodes), self.mode_count
-        )
-        return values
+    def fields(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) u [mm] and (n, m) v_i of the nodes, NaN where there is no lattice."""
+        nodal = unknowns.reshape(-1, 2 + self.mode_count)
+        v = np.full((len(nodal), self.mode_count), np.nan)
+        v[self._lattice_nodes] = nodal[self._lattice_nodes, 2:]
+        return nodal[:, :2], v
 
     def strains(self, unknowns: FloatArray) -> list[FloatArray]:
         """(points, s) generalised strains, of the lattice and, if there is any, of the bulk."""
@@ -162,15 +156,6 @@ class HomogenizedBody:
         for q in found:
             q[..., :_FIRST_ORDER] += np.eye(2).ravel()
         return [q.reshape(-1, q.shape[-1]) for q in found]
-
-    def _number_unknowns(self) -> None:
-        """u of all nodes, then v of those of the lattice."""
-        nodes = np.unique(self.mesh.cells[self.is_lattice])
-        self._lattice_nodes, n, m = nodes, len(self.mesh.nodes), self.mode_count
-        self._u_dofs = np.arange(2 * n).reshape(n, 2)
-        self._v_dofs = np.full((n, m), -1)
-        self._v_dofs[nodes] = 2 * n + np.arange(m * len(nodes)).reshape(len(nodes), m)
-        self.size = 2 * n + m * len(nodes)
 
     def _region(self, chosen: BoolArray, points: int, m: int) -> _Region:
         cells = self.mesh.cells[chosen]
@@ -183,78 +168,71 @@ class HomogenizedBody:
             g = _FIRST_ORDER + m + 2 * i
             B[:, :, _FIRST_ORDER + i, :, 2 + i] = at.shapes
             B[:, :, g : g + 2, :, 2 + i] = at.gradients.swapaxes(2, 3)
-        dofs = np.concatenate([self._u_dofs[cells], self._v_dofs[cells][..., :m]], axis=2)
+        dofs = cells[..., None] * (2 + self.mode_count) + np.arange(2 + m)
         return _Region(at, B.reshape(c, p, -1, k * (2 + m)), dofs.reshape(c, -1))
 
     def _constrain(self, low: FloatArray, high: FloatArray) -> None:
         """Which unknowns are free, which follow another one, and how the load moves the rest."""
-        nodes, loading = self.mesh.nodes, self.loading
-        near = 1e-6 * float((high - low).max())
-        on = [np.abs(nodes - edge) < near for edge in (low, high)]
-        plates, sides = [e[:, 0] for e in on], [e[:, 1] for e in on]
-        held, direction = np.zeros(self.size, bool), np.zeros(self.size)
-        direction[self._u_dofs[:, 1]] = -loading.lateral * (nodes[:, 1] - 0.5 * (low + high)[1])
+        nodes, loading, n = self.mesh.nodes, self.loading, len(self.mesh.nodes)
+        near, half = 1e-6 * float((high - low).max()), 0.5 * (high - low)
+        (left, bottom), (right, top) = (near > np.abs(nodes - e).T for e in (low, high))
+        y, push, shear = nodes[:, 1] - low[1] - half[1], 0.5 * self.length, loading.shear
+        held, direction = np.zeros((2, n, 2 + self.mode_count))
+        direction[:, 1] = -loading.lateral * y
         if loading.quarter:
-            for axis, mirror in enumerate((plates[0], sides[0])):
-                held[self._u_dofs[mirror, axis]] = True
-            plates[0] = np.zeros(len(nodes), bool)
-        half, middle = 0.5 * (high - low), 0.5 * (high + low)
-        for sign, plate in zip((1.0, -1.0), plates, strict=True):
-            y = (nodes[plate, 1] - middle[1]) / half[1]
-            held[self._u_dofs[plate, 0]] = True
-            push = loading.compression + loading.bending * y
-            direction[self._u_dofs[plate, 0]] = 0.5 * sign * self.length * push
+            held[left, 0] = held[bottom, 1] = True
+            left = np.zeros(n, bool)
+        elif loading.plates == "sliding" and loading.sides != "guided":
+            edge = np.flatnonzero(left)
+            held[edge[np.argmin(np.abs(y[edge]))], 1] = True
+        for sign, plate in ((1.0, left), (-1.0, right)):
+            along = loading.compression + loading.bending * y[plate] / half[1]
+            direction[plate, 0] = sign * push * along
+            held[plate, 0] = True
             if loading.plates == "clamped":
-                held[self._u_dofs[plate, 1]] = True
-                direction[self._u_dofs[plate, 1]] -= 0.5 * sign * self.length * loading.shear
-        if loading.plates == "sliding" and loading.sides != "guided":
-            left = np.flatnonzero(plates[0])
-            held[self._u_dofs[left[np.argmin(np.abs(nodes[left, 1] - middle[1]))], 1]] = True
-        if loading.sides == "guided":
-            held[self._u_dofs[sides[0] | sides[1], 1]] = True
-        if loading.pattern_at_plates == "zero":
-            self._hold_pattern(held, plates[0] | plates[1])
-        if loading.pattern_at_bulk == "zero" and not self.is_lattice.all():
-            at_bulk = np.zeros(len(nodes), bool)
-            at_bulk[self.mesh.cells[~self.is_lattice]] = True
-            self._hold_pattern(held, at_bulk)
-        follows = np.arange(self.size)
-        if loading.sides == "periodic":
-            lower, upper = (np.flatnonzero(side) for side in sides)
-            lower, upper = (s[np.argsort(nodes[s, 0])] for s in (lower, upper))
-            x = nodes[lower, 0], nodes[upper, 0]
-            if len(lower) != len(upper) or not np.allclose(*x, rtol=0, atol=near):
+                direction[plate, 1] -= sign * push * shear
+                held[plate, 1] = True
+        held[(bottom | top) & (loading.sides == "guided"), 1] = True
+        held[(left | right) & (loading.pattern_at_plates == "zero"), 2:] = True
+        held[np.setdiff1d(np.arange(n), self._lattice_nodes), 2:] = True
+        if loading.pattern_at_bulk == "zero":
+            held[np.unique(self.mesh.cells[~self.is_lattice]), 2:] = True
+        self._eliminate(held != 0.0, direction, self._followed(bottom, top, near))
+
+    def _followed(self, bottom: BoolArray, top: BoolArray, near: float) -> IntArray:
+        """(n,) the node whose fields each node's follow: itself, or its periodic partner."""
+        followed, x = np.arange(len(self.mesh.nodes)), self.mesh.nodes[:, 0]
+        if self.loading.sides == "periodic":
+            lower, upper = (np.flatnonzero(s)[np.argsort(x[s])] for s in (bottom, top))
+            if len(lower) != len(upper) or not np.allclose(x[lower], x[upper], rtol=0, atol=near):
                 raise InputError(
                     "macroscopic mesh: expected nodes alike on both periodic sides, got others"
                 )
-            follows[self._u_dofs[upper]] = self._u_dofs[lower]
-            has_v = self._v_dofs[upper] >= 0
-            follows[self._v_dofs[upper][has_v]] = self._v_dofs[lower][has_v]
-        own = np.flatnonzero(~held & (follows == np.arange(self.size)))
-        numbers = np.full(self.size, -1)
-        numbers[own] = np.arange(len(own))
-        place = np.where(held, -1, numbers[follows])
-        rows = np.flatnonzero(place >= 0)
-        self.T = csr_array((np.ones(len(rows)), (rows, place[rows])), (self.size, len(own)))
-        """(size, free_count): all unknowns are T y + load * direction."""
-        self.direction: FloatArray = np.where(place < 0, direction, direction - direction[follows])
+            followed[upper] = lower
+        return followed
+
+    def _eliminate(self, held: BoolArray, direction: FloatArray, followed: IntArray) -> None:
+        """Number the free unknowns; an InputError if a rigid motion is among them."""
+        is_free = ~held & (followed == np.arange(len(held)))[:, None]
+        numbers = np.where(is_free, np.cumsum(is_free).reshape(held.shape) - 1, -1)
+        place = np.where(held, -1, numbers[followed]).ravel()
+        offset = direction - direction[followed]
+        self.direction: FloatArray = np.where(place < 0, direction.ravel(), offset.ravel())
         """(size,) derivatives of all unknowns by the load, y fixed."""
-        self.free_count, self.is_pattern = len(own), own >= 2 * len(nodes)
-        """Number of y, and which of them are amplitudes v."""
-        self._require_support()
-
-    def _hold_pattern(self, held: BoolArray, where: BoolArray) -> None:
-        dofs = self._v_dofs[where]
-        held[dofs[dofs >= 0]] = True
-
-    def _require_support(self) -> None:
-        """No rigid motion may be left."""
-        X, rigid = self.mesh.nodes, np.zeros((self.size, 3))
-        X = (X - X.mean(axis=0)) / np.ptp(X, axis=0).max()
-        rigid[self._u_dofs[:, 0], 0] = rigid[self._u_dofs[:, 1], 1] = 1.0
-        rigid[self._u_dofs.T, 2] = -X[:, 1], X[:, 0]
-        away = rigid - self.T @ self.picked(rigid)
-        if np.linalg.matrix_rank(away, 1e-6) < 3:
+        self.free_count, rows = int(is_free.sum()), np.flatnonzero(place >= 0)
+        shape = held.size, self.free_count
+        self.T = csr_array((np.ones(len(rows)), (rows, place[rows])), shape)
+        """(size, free_count): all unknowns are T y + load * direction."""
+        self.is_pattern: BoolArray = np.broadcast_to(np.arange(held.shape[1]) > 1, held.shape)[
+            is_free
+        ]
+        """(free_count,) which of y are amplitudes v."""
+        X = self.mesh.nodes - self.mesh.nodes.mean(axis=0)
+        rigid = np.zeros((*held.shape, 3))
+        rigid[:, 0, 0] = rigid[:, 1, 1] = np.ptp(X)
+        rigid[:, :2, 2] = np.stack([-X[:, 1], X[:, 0]], axis=1)
+        flat = rigid.reshape(-1, 3)
+        if np.linalg.matrix_rank(flat - self.T @ self.picked(flat), 1e-6) < 3:
             raise InputError(
                 "homogenized body: expected supports that leave no rigid motion, got too few; "
                 "give plates more than one node, clamp them or guide the sides"
@@ -264,21 +242,14 @@ class HomogenizedBody:
         """(free_count, ...) the y nearest to values of all unknowns (size, ...)."""
         return np.asarray(((self.T.T @ values).T / self.T.sum(axis=0)).T)
 
-    def matrix(self, element_matrices: Sequence[FloatArray]) -> csr_array:
-        """The sparse matrix of y from those of the regions' elements (c, d, d)."""
-        whole = csr_array((self.size, self.size))
-        for region, K in zip(self.regions, element_matrices, strict=True):
+    def assembled(self, parts: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, Any]:
+        """(size,) forces and (size, size) matrix of those of the regions' elements."""
+        forces, whole = np.zeros(len(self.direction)), csr_array((len(self.direction),) * 2)
+        for region, (f, K) in zip(self.regions, parts, strict=True):
             rows, columns = np.broadcast_arrays(region.dofs[:, :, None], region.dofs[:, None, :])
-            entries = K.ravel(), (rows.ravel(), columns.ravel())
-            whole = whole + csr_array(entries, whole.shape)
-        return csr_array(self.T.T @ whole @ self.T).sorted_indices()
-
-    def summed(self, element_forces: Sequence[FloatArray]) -> FloatArray:
-        """(size,) forces on all unknowns from those of the regions' elements (c, d)."""
-        total = np.zeros(self.size)
-        for region, forces in zip(self.regions, element_forces, strict=True):
-            total += np.bincount(region.dofs.ravel(), forces.ravel(), self.size)
-        return total
+            whole = whole + csr_array((K.ravel(), (rows.ravel(), columns.ravel())), whole.shape)
+            forces += np.bincount(region.dofs.ravel(), f.ravel(), len(forces))
+        return forces, whole
 
     def bulk_response(self, strains: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Energy density (p,), P (p, 4) and moduli (p, 4, 4) [MPa] of the bulk at F̄ (p, 4)."""
@@ -324,22 +295,18 @@ class LinearisedBody:
         if len(strains) > 1:
             _, P, A = body.bulk_response(strains[1])
             stresses, moduli = [*stresses, P], [*moduli, A]
-        forces, matrices, along = [], [], []
+        parts = []
         for region, s, D in zip(body.regions, stresses, moduli, strict=True):
             c, p, size, _ = region.B.shape
-            weighted = region.at.weights[..., None] * s.reshape(c, p, size)
-            forces.append(np.einsum("cpsd,cps->cd", region.B, weighted))
-            DB = D.reshape(c, p, size, size) @ region.B
-            weighted = region.at.weights[..., None, None] * DB
-            K = (region.B.swapaxes(2, 3) @ weighted).sum(axis=1)
-            matrices.append(K)
-            along.append(np.einsum("cde,ce->cd", K, body.direction[region.dofs]))
-        self.forces = body.summed(forces)
-        self.residual = body.T.T @ self.forces
-        self.along_load = body.summed(along)
-        self.load_force = body.T.T @ self.along_load
+            weights = region.at.weights[..., None]
+            f = np.einsum("cpsd,cps->cd", region.B, weights * s.reshape(c, p, size))
+            DB = weights[..., None] * (D.reshape(c, p, size, size) @ region.B)
+            parts.append((f, (region.B.swapaxes(2, 3) @ DB).sum(axis=1)))
+        self.forces, whole = body.assembled(parts)
+        self.along_load = whole @ body.direction
+        self.residual, self.load_force = body.T.T @ self.forces, body.T.T @ self.along_load
         self.load_size = float(np.linalg.norm(self.along_load))
-        self.stiffness = body.matrix(matrices)
+        self.stiffness = csr_array(body.T.T @ whole @ body.T).sorted_indices()
         try:
             factor = factorise(self.stiffness, definite=False)
         except ArithmeticError:

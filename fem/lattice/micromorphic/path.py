@@ -152,6 +152,7 @@ class HomogenizedPath:
         every = body.gathered(rows)
         if not every[..., 1].min() > 0:
             return None
+        u, v = body.fields(unknowns)
         energy = float(areas[0] @ every[..., 0].mean(axis=1))
         if len(areas) > 1:
             energy += float(areas[1] @ body.bulk_response(strains[1])[0])
@@ -161,8 +162,8 @@ class HomogenizedPath:
             load=load,
             force=body.copies * float(work_rate + at.load_force @ dy) / body.length,
             energy=body.copies * energy,
-            displacement=body.displacement(unknowns),
-            amplitudes=body.amplitudes(unknowns),
+            displacement=u,
+            amplitudes=v,
             strains=strains[0],
             stresses=stresses,
             negative_eigenvalues=at.negative,
@@ -265,10 +266,10 @@ class HomogenizedPath:
 
     def largest(self, mode: FloatArray) -> tuple[float, float]:
         """The largest displacement by the pattern, sum |v_i| max |phi_i|, and that of u [mm]."""
-        body = self.body
-        a, peaks = body.T @ mode, np.linalg.norm(body.rves[0].shapes, axis=2).max(axis=1)
-        pattern = np.nan_to_num(np.abs(body.amplitudes(a))) @ peaks
-        return float(pattern.max()), float(np.linalg.norm(body.displacement(a), axis=1).max())
+        u, v = self.body.fields(self.body.T @ mode)
+        peaks = np.linalg.norm(self.body.rves[0].shapes, axis=2).max(axis=1)
+        pattern = np.nan_to_num(np.abs(v)) @ peaks
+        return float(pattern.max()), float(np.linalg.norm(u, axis=1).max())
 
 
 def _expected(states: Sequence[HomogenizedState], load: float) -> FloatArray:
