@@ -7,8 +7,8 @@ docs/homogenization.md, as Markdown:
   the branch of the periodic cell.
 - ``strips``: n cells between clamped plates, periodic sideways: direct simulations (mean of two
   positions of the lattice against the plates), and homogenized ones.
-- ``specimen``: the 6 x 10 specimen, direct and homogenized.
-- ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to it.
+- ``specimen``: the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
+- ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.
 - ``cost``: seconds and memory a linearisation and RVE, from 60 to 10 000 RVEs.
 
 Everything has square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material, elements of
@@ -22,6 +22,7 @@ import resource
 import time
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,74 +184,67 @@ def strips() -> None:
 
 
 def homogenized_specimen(
-    rve: RVE,
-    specimen: Specimen,
-    divisions: tuple[int, int] | None = None,
-    loads: tuple[float, ...] = (0.078, 0.128),
-    **options: object,
+    rves: RVE | list[RVE],
+    size: tuple[int, int],
+    divisions: tuple[int, int],
+    loads: tuple[float, ...],
+    points: int = 2,
+    **options: Any,
 ) -> tuple[Homogenized, HomogenizedBody, float]:
-    loading = PlateLoading(**options)  # type: ignore[arg-type]
-    body = HomogenizedBody.of_specimen(specimen, rve, loading, divisions=divisions)
+    """What is found, of what, and in how many seconds."""
+    body = HomogenizedBody.of_specimen(
+        Specimen(*size), rves, PlateLoading(**options), divisions=divisions, points=points
+    )
     start = time.perf_counter()
-    found = homogenize(body, loads)
-    return found, body, time.perf_counter() - start
+    return homogenize(body, loads), body, time.perf_counter() - start
 
 
-def specimen_row(
-    name: str, found: Homogenized, count: object, seconds: float, exact: list[float]
-) -> None:
-    critical = found.critical.load if found.critical else np.nan
-    values = [critical, *(s.energy for s in found.states), *(s.force for s in found.states[-1:])]
-    if found.states[-1].branch == "primary":
-        values = values[:2]
-    texts = [f"{100 * critical:.3f} %", *(f"{v:.5f}" for v in values[1:])]
-    differences = [f"{t} ({v / e - 1:+.2%})" for t, v, e in zip(texts, values, exact, strict=False)]
-    unstable = found.states[-1].negative_eigenvalues
-    row(name, count, *differences, *[""] * (4 - len(differences)), unstable, f"{seconds:.0f}")
+def compared(values: list[float], exact: list[float]) -> list[str]:
+    """A critical strain, energies and a force, each with its difference."""
+    texts = [f"{values[0]:.3%}", *(f"{v:.5f}" for v in values[1:])]
+    pairs = zip(texts, values, exact[: len(values)], strict=True)
+    with_difference = [f"{t} ({v / e - 1:+.2%})" for t, v, e in pairs]
+    return with_difference + [""] * (len(exact) - len(values))
 
 
 def specimen() -> None:
-    head(
-        "6 x 10",
-        "RVEs",
-        "ε_c",
-        "energy at 7.8 % [N]",
-        "at 12.8 %",
-        "force [N/mm]",
-        "negative eigenvalues",
-        "s",
-    )
-    start = time.perf_counter()
-    direct = simulate(Experiment())
-    before, after = direct.at(0.078), direct.at(0.128)
-    exact = [direct.info["critical"]["strain"], before.energy, after.energy, after.reaction]
-    texts = [f"{100 * exact[0]:.3f} %", *(f"{v:.5f}" for v in exact[1:])]
-    row("direct", "", *texts, after.negative_pivots, f"{time.perf_counter() - start:.0f}")
-    for name, rve, parts, options in (
-        ("quarter", analytic(), (4, 4), {"quarter": True}),
-        ("quarter", analytic(), (6, 10), {"quarter": True}),
-        ("quarter", analytic(), (12, 20), {"quarter": True}),
-        ("quarter, Bloch φ", computed(), (6, 10), {"quarter": True}),
-        ("whole", analytic(), (3, 5), {}),
-        (
-            "first order, quarter",
-            RVE(supercell(), MATERIAL, [], JUNCTION),
-            (6, 10),
-            {"quarter": True},
-        ),
-    ):
-        found, body, seconds = homogenized_specimen(rve, Specimen(), parts, **options)
-        specimen_row(name, found, body.point_count, seconds, exact)
+    for size, loads in (((6, 10), (0.078, 0.128)), ((12, 10), (0.082, 0.127))):
+        columns = [f"energy at {e:.1%} [N]" for e in loads]
+        name = f"{size[0]} x {size[1]}"
+        head(name, "RVEs", "ε_c", *columns, "force there [N/mm]", "negative eigenvalues", "s")
+        start = time.perf_counter()
+        direct = simulate(Experiment(Specimen(*size), strains=loads))
+        states = [direct.at(e) for e in loads]
+        seconds = time.perf_counter() - start
+        exact = [direct.info["critical"]["strain"], *(s.energy for s in states), states[1].reaction]
+        texts = [f"{exact[0]:.3%}", *(f"{v:.5f}" for v in exact[1:])]
+        row("direct", "", *texts, states[1].negative_pivots, f"{seconds:.0f}")
+        x, y = size
+        without = RVE(supercell(), MATERIAL, [], JUNCTION)
+        for what, rve, parts, options in (
+            ("quarter", analytic(), (x // 2 + 1, y // 2 + 1), {"quarter": True}),
+            ("quarter", analytic(), (x, y), {"quarter": True}),
+            ("quarter", analytic(), (2 * x, 2 * y), {"quarter": True}),
+            ("quarter, 3 x 3 points", analytic(), (x, y), {"quarter": True, "points": 3}),
+            ("quarter, Bloch φ", computed(), (x, y), {"quarter": True}),
+            ("whole", analytic(), (x // 2, y // 2), {}),
+            ("first order, quarter", without, (x, y), {"quarter": True}),
+        ):
+            found, body, seconds = homogenized_specimen(rve, size, parts, loads, **options)
+            critical = found.critical.load if found.critical else np.nan
+            values = [critical, *(s.energy for s in found.states)]
+            buckled = [s for s in found.states if s.branch != "primary"]
+            values = [*values, buckled[-1].force] if buckled else values[:2]
+            unstable = buckled[-1].negative_eigenvalues if buckled else ""
+            row(what, body.point_count, *compared(values, exact), unstable, f"{seconds:.0f}")
 
 
 def choices() -> None:
     head("6 x 10, quarter, 24 RVEs", "ε_c", "change", "force at 12.8 % [N/mm]", "change")
     reference: list[float] = []
 
-    def case(name: str, rves: RVE, **options: object) -> None:
-        found, _, _ = homogenized_specimen(
-            rves, Specimen(), (4, 6), (0.128,), quarter=True, **options
-        )
+    def case(name: str, rves: RVE | list[RVE], **options: Any) -> None:
+        found = homogenized_specimen(rves, (6, 10), (4, 6), (0.128,), quarter=True, **options)[0]
         e = found.critical.load if found.critical else np.nan
         force = found.states[-1].force if found.states else np.nan
         reference[:] = reference or [e, force]
@@ -259,16 +253,15 @@ def choices() -> None:
 
     case("as above", analytic())
     case("centre on a hole", analytic(HOLE))
+    grid = [(PITCH * (i + 0.5) / 2, PITCH * (j + 0.5) / 2) for i in (0, 1) for j in (0, 1)]
+    case("mean over 2 x 2 centres in a cell", [analytic(centre) for centre in grid])
     case("v free at bulk", analytic(), pattern_at_bulk="free")
     case("Bloch φ", computed())
     sine = PATTERN.sine
     for name, change in (
         ("φ_x up by 10 %", PlaneWaves(PATTERN.vectors, PATTERN.cosine, sine * [1.1, 1.0])),
-        (
-            "second wave up by 2 %",
-            PlaneWaves(PATTERN.vectors, PATTERN.cosine, sine * [[1.0], [1.02]]),
-        ),
-        ("phases moved by l/20", PATTERN.moved((0.05 * PITCH, 0.05 * PITCH))),
+        ("one wave up by 2 %", PlaneWaves(PATTERN.vectors, PATTERN.cosine, sine * [[1.0], [1.02]])),
+        ("φ moved by l/20 both ways", PATTERN.moved((0.05 * PITCH, 0.05 * PITCH))),
     ):
         case(name, RVE(supercell(), MATERIAL, [change], JUNCTION))
 
