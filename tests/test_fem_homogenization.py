@@ -234,6 +234,19 @@ def test_a_quarter_is_as_the_whole_on_the_primary_path() -> None:
     assert np.isnan(whole.amplitudes).any()  # in the bulk
 
 
+def test_a_critical_point_of_u_alone_does_not_hide_the_pattern_s() -> None:
+    """A long strip between sliding plates bows before its pattern grows."""
+    loading = PlateLoading(plates="sliding")
+    specimen = Specimen(16, 2, bulk_x=0.0, bulk_y=0.0)
+    body = HomogenizedBody.of_specimen(specimen, rve(), loading, divisions=(6, 1))
+    found = homogenize(body, [0.09])
+    assert [c.kind for c in found.criticals] == ["displacement", "pattern"]
+    assert found.criticals[0].load < found.criticals[1].load
+    assert found.critical is found.criticals[1]
+    assert found.states[0].branch == "buckled"
+    assert found.states[0].negative_eigenvalues > 0  # bowing is not followed
+
+
 def test_a_plate_s_force_is_the_derivative_of_the_energy() -> None:
     """In bending, shear and compression, on the buckled branch too."""
     for loading in (PlateLoading(), PlateLoading(0, 1), PlateLoading(0.5, 0, 1, plates="sliding")):

@@ -21,7 +21,7 @@ MOST_MODULES, MOST_LINES = 198, 42_100
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = ("fem/lattice/micromorphic", "fem/lattice/cell.py", "fem/sparse_factor.py")
-OWN_BOUNDS = {HOMOGENIZATION: (10, 1_832)}
+OWN_BOUNDS = {HOMOGENIZATION: (10, 1_800)}
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 
 PRIVATE_WORDS = """

@@ -87,6 +87,7 @@ def homogenize(
                 met += states
                 return ended(outcome)
             block = "pattern" if found.kind == "displacement" else ""
+            continue
         if here.load >= pending[0] - 1e-12:
             met.append(here)
             pending.pop(0)

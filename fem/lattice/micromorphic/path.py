@@ -159,7 +159,7 @@ class HomogenizedPath:
         stresses = at.stresses + np.einsum("pst,pt->ps", at.moduli, strains[0] - at.strains)
         work_rate = body.direction @ (at.forces + (load - at.load) * at.along_load)
         return HomogenizedState(
-            load=load,
+            load=float(load),
             force=body.copies * float(work_rate + at.load_force @ dy) / body.length,
             energy=body.copies * energy,
             displacement=u,
