@@ -20,8 +20,13 @@ MOST_ENTRIES = 12
 MOST_MODULES, MOST_LINES = 198, 42_100
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
-HOMOGENIZATION = ("fem/lattice/micromorphic", "fem/lattice/cell.py", "fem/sparse_factor.py")
-OWN_BOUNDS = {HOMOGENIZATION: (10, 1_800)}
+HOMOGENIZATION = (
+    "fem/lattice/micromorphic", "fem/lattice/cell.py", "fem/sparse_factor.py",
+    "validation/homogenization.py", "src/modeharvest/runs/homogenization",
+    "src/modeharvest/cli/homogenization.py",
+    "src/modeharvest/report/homogenization.py", "src/modeharvest/report/figures/homogenization.py",
+)  # fmt: skip
+OWN_BOUNDS = {HOMOGENIZATION: (18, 3_000)}
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 
 PRIVATE_WORDS = """

@@ -31,8 +31,8 @@ def cases(
     if name is not None:
         print(case_text(name), end="")
         return
-    commands = {"experiment": "run", "lattice": "bloch, modes", "images": "harvest"}
-    for kind, command in {**commands, "study": "study"}.items():
+    commands = {"experiment": "run", "lattice": "bloch, modes", "homogenization": "homogenize"}
+    for kind, command in {**commands, "images": "harvest", "study": "study"}.items():
         for shipped, title in shipped_cases(kind).items():
             print(f"{shipped:18}{command:14}{title}")
 

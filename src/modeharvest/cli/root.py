@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from modeharvest.cli import benchmark, commands, messages
+from modeharvest.cli import benchmark, commands, homogenization, messages
 from modeharvest.util import __version__
 from modeharvest.util.machine import is_first
 
@@ -47,6 +47,7 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
         commands.run, commands.fem, commands.image, commands.correlate, commands.validate,
     ),
     "An infinite lattice": (commands.bloch, commands.modes),
+    "Modes in use": (homogenization.homogenize,),
     "Photographs of a test": (commands.harvest, commands.measure),
     "How good a measurement is": (commands.study, benchmark.score),
     "To begin with": (commands.cases,),

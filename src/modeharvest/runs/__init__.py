@@ -1,7 +1,7 @@
 """Runs: a case from its TOML file to a folder of results, in stages that can be resumed.
 
-A module, or a folder, for each kind: virtual experiments, lattices, photographs, studies,
-benchmarks for DIC codes, and the twin of a real experiment.
+A module, or a folder, for each kind: virtual experiments, lattices, homogenized specimens,
+photographs, studies, benchmarks for DIC codes, and the twin of a real experiment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def run(
     """Run a case of any kind, from its options to its report; what is finished is not done again.
 
     ``case``: a shipped case's name, the path of a TOML file, or the case itself: a virtual
-    experiment, the twin of a real one, an infinite lattice, a study, or photographs of a test.
+    experiment, the twin of a real one, a lattice, a homogenized specimen, a study, or photographs.
     ``folder``: where to leave the files. Returns the content of ``summary.json``.
     """
     from modeharvest.runs.case import Case, CaseModel, read_tables, table_of_kind
@@ -34,6 +34,11 @@ def run(
         from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 
         return LatticeAnalysis(LatticeCase.of(case), folder, progress, source).all()
+    if kind == "homogenization":
+        from modeharvest.runs.homogenization.case import HomogenizationCase
+        from modeharvest.runs.homogenization.pipeline import HomogenizationRun
+
+        return HomogenizationRun(HomogenizationCase.of(case), folder, progress, source).all()
     if kind == "study":
         from modeharvest.runs.study import StudyAnalysis, StudyCase
 

@@ -31,6 +31,7 @@ from modeharvest.util.typed import CHECKS, described, made, nearest, require_typ
 
 _SHIPPED = resources.files("modeharvest") / "cases"
 _KINDS = {
+    "homogenization": ("a homogenized specimen", "modeharvest homogenize {}", "paper-homogenized"),
     "lattice": (
         "an infinite lattice",
         "modeharvest modes {} --out DIR', or 'modeharvest bloch {}",
@@ -85,7 +86,7 @@ CaseType = TypeVar("CaseType", bound=CaseModel)
 
 
 def table_of_kind(tables: Mapping[str, Any]) -> str:
-    """The table that makes a case's kind: "lattice", "study", "images", "experiment" or ""."""
+    """The table that makes a case's kind, such as "lattice" or "experiment"; or ""."""
     return next((name for name in _KINDS if name in tables), "")
 
 

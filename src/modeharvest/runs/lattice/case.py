@@ -59,24 +59,8 @@ class LatticeSpec(Protocol):
         """The primitive cell, meshed; an InputError if there is no such lattice."""
 
 
-class _HoleStacking:
-    """Circular holes, one in a primitive cell."""
-
-    pitch: float
-    diameter: float
-    mesh_size: float
-    symmetry: str
-
-    def cell(self) -> UnitCell:
-        """The primitive cell, by the function of :mod:`modeharvest.fem.lattice.cells`."""
-        from modeharvest.fem.lattice.cells import hexagonal, square
-
-        stacked = square if self.symmetry == "square" else hexagonal
-        return stacked(self.pitch, self.diameter, self.mesh_size)
-
-
 @dataclass(frozen=True)
-class SquareLattice(_HoleStacking):
+class SquareLattice:
     """Holes in square stacking: l, d, and the edge length of the elements [mm]."""
 
     pitch: float = 1.9
@@ -84,15 +68,27 @@ class SquareLattice(_HoleStacking):
     mesh_size: float = 0.15
     symmetry = "square"
 
+    def cell(self) -> UnitCell:
+        """The primitive cell, with one hole."""
+        from modeharvest.fem.lattice.cells import square
+
+        return square(self.pitch, self.diameter, self.mesh_size)
+
 
 @dataclass(frozen=True)
-class HexagonalLattice(_HoleStacking):
+class HexagonalLattice:
     """Holes in hexagonal stacking: distance of centres, d, edge length of the elements [mm]."""
 
     pitch: float = 1.386
     diameter: float = 1.28
     mesh_size: float = 0.1
     symmetry = "hexagonal"
+
+    def cell(self) -> UnitCell:
+        """The primitive cell, with one hole."""
+        from modeharvest.fem.lattice.cells import hexagonal
+
+        return hexagonal(self.pitch, self.diameter, self.mesh_size)
 
 
 @dataclass(frozen=True)
@@ -155,12 +151,9 @@ class FileLattice:
 
 
 LATTICES: dict[str, type[Any]] = {
-    "square": SquareLattice,
-    "hexagonal": HexagonalLattice,
-    "tetrachiral": TetrachiralLattice,
-    "hexachiral": HexachiralLattice,
-    "file": FileLattice,
-}
+    "square": SquareLattice, "hexagonal": HexagonalLattice, "tetrachiral": TetrachiralLattice,
+    "hexachiral": HexachiralLattice, "file": FileLattice,
+}  # fmt: skip
 
 Component = float | Literal["free"]
 _ZERO = ((0.0, 0.0), (0.0, 0.0))

@@ -1,0 +1,26 @@
+"""The command that puts modes to use: a specimen homogenized with them."""
+
+from __future__ import annotations
+
+from modeharvest.cli.messages import CaseName, OutFolder, bars
+
+
+def homogenize(case: CaseName, out: OutFolder) -> None:
+    """Homogenize a specimen with modes, measured or computed (needs dolfinx).
+
+    Micromorphic homogenization: finite elements of u and the modes' amplitudes v, with an RVE at
+    each of their points. Leaves the critical strain, forces and energies with the standard
+    deviations that a measured mode's error bars make, beside a direct simulation of all holes:
+    report.html, summary.json, homogenized.h5. The mode of 'paper-homogenized' is measured in
+    the images of the paper's virtual experiment, which is run in DIR/experiment.
+    """
+    from modeharvest.report.homogenization import homogenization_report
+    from modeharvest.report.model import print_report
+    from modeharvest.runs.homogenization.case import HomogenizationCase
+
+    checked = HomogenizationCase.read(case)
+    from modeharvest.runs.homogenization.pipeline import HomogenizationRun
+
+    with bars() as progress:
+        summary = HomogenizationRun(checked, out, progress, case).all()
+    print_report(homogenization_report(summary), out)

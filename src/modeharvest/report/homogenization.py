@@ -1,0 +1,191 @@
+"""Report of a homogenized specimen: beside the direct simulation, and beside what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from modeharvest.report.figures import homogenization as figures
+from modeharvest.report.figures.maps import ColourScale
+from modeharvest.report.model import (
+    Card,
+    KeyNumber,
+    Measured,
+    Report,
+    ReportFigure,
+    ReportTable,
+    Section,
+    caption,
+    material_text,
+    number,
+    text_of,
+)
+from modeharvest.runs.homogenization.results import HomogenizationData, aligned
+
+Summary = Mapping[str, Any]
+
+
+def homogenization_report(summary: Summary, data: HomogenizationData | None = None) -> Report:
+    """The report of a homogenized specimen.
+
+    ``summary``: the content of ``summary.json``. ``data``: what its figures show; without, the
+    report has numbers only, as for the terminal.
+    """
+    table = ReportTable.of("homogenized-states", map(_state_row, _pairs(summary)))
+    return Report(
+        kind="homogenization",
+        title=summary["title"],
+        findings=findings(summary),
+        keys=key_numbers(summary),
+        sections=[
+            Section.of("homogenized-response", _response_cards(data)),
+            Section.of("homogenized-states", Card.tabular(table, wide=True)),
+            Section.of("homogenized-amplitude", _amplitude_cards(data)),
+            Section.of("homogenized-mode", _mode_cards(summary)),
+        ],
+        notes=[text_of("homogenized-choices", **summary["case"]["homogenization"])],
+        command=data.command if data else "",
+        case=summary["case"],
+        files=summary["files"],
+        costs={"RVEs": number(summary["rves"]),
+               "linearisations of the specimen": number(summary["linearisations"])},
+        versions=summary["versions"],
+        **caption("page-homogenization"),
+    )  # fmt: skip
+
+
+def _off(value: float | None, of: float | None) -> float | None:
+    """How far a value is from another one [%]."""
+    return None if value is None or not of else 100.0 * (value / of - 1.0)
+
+
+def _pairs(summary: Summary) -> list[tuple[Mapping[str, Any], Mapping[str, Any] | None]]:
+    """Homogenized states with the direct ones at their strains."""
+    direct = {state["nominal_strain"]: state for state in summary["direct"]["states"]}
+    return [(state, direct.get(state["nominal_strain"])) for state in summary["states"]]
+
+
+def _state_row(pair: tuple[Mapping[str, Any], Mapping[str, Any] | None]) -> Mapping[str, Any]:
+    state, direct = pair
+    row = {"strain": f"{100 * state['nominal_strain']:.4g}", "branch": state["branch"]}
+    for name, key, sd in (
+        ("force", "force_N_per_mm", "force_sd_N_per_mm"), ("energy", "energy_N", "energy_sd_N"),
+    ):  # fmt: skip
+        errors = () if state[sd] is None else (state[sd],)
+        row[name] = Measured(state[key], errors, 5)
+        row[f"{name}_direct"] = None if direct is None else f"{direct[key]:.5f}"
+        row[f"{name}_off"] = None if direct is None else f"{_off(state[key], direct[key]):+.2f}"
+    return row
+
+
+def findings(summary: Summary) -> list[str]:
+    """What was found, in sentences."""
+    text, critical, direct = [], summary["critical_strain"], summary["direct"]["critical_strain"]
+    if critical is None:
+        text.append(text_of("homogenized-no-critical", outcome=summary["outcome"]))
+    else:
+        sd = summary["critical_strain_sd"]
+        error = "" if sd is None else f" ± {100 * sd:.4f}"
+        last = summary["criticals"][-1]
+        text.append(text_of("homogenized-critical", value=100 * critical, error=error, last=last))
+        if direct is not None:
+            text.append(text_of("homogenized-direct", value=100 * direct,
+                                off=_off(critical, direct)))  # fmt: skip
+    first = summary["first_order_critical_strain"]
+    if first is not None:
+        off = _off(first, direct)
+        text.append(text_of("homogenized-first-order", value=100 * first,
+                            off="" if off is None else f", {off:+.1f} %"))  # fmt: skip
+    mode = summary["mode"]
+    if mode is not None and summary["sensitivities"]:
+        text.append(text_of("homogenized-snapped", change=100 * max(mode["wave_change"])))
+    amplitude = summary["amplitude"]
+    if amplitude is not None:
+        share = 100 * amplitude["difference_rms_mm"] / amplitude["measured_rms_mm"]
+        text.append(text_of("homogenized-amplitude", share=share, **amplitude))
+    text.append(
+        f"The specimen is of the {material_text(summary['case']['experiment']['material'])}."
+    )
+    return text
+
+
+def key_numbers(summary: Summary) -> list[KeyNumber]:
+    """The few numbers at the top."""
+    critical, direct = summary["critical_strain"], summary["direct"]["critical_strain"]
+    keys = []
+    if critical is not None:
+        off = _off(critical, direct)
+        remark = "" if off is None else f"{off:+.1f} % from the direct simulation's"
+        keys.append(KeyNumber.of("homogenized-critical", f"{100 * critical:.3f}", remark=remark))
+    if direct is not None:
+        keys.append(KeyNumber.of("direct-critical", f"{100 * direct:.3f}"))
+    first = summary["first_order_critical_strain"]
+    if first is not None:
+        keys.append(KeyNumber.of("first-order-critical", f"{100 * first:.3f}"))
+    pairs = [(state, other) for state, other in _pairs(summary) if other is not None]
+    if pairs:
+        state, other = pairs[-1]
+        for name, key in (("force", "force_N_per_mm"), ("energy", "energy_N")):
+            off = _off(state[key], other[key])
+            keys.append(KeyNumber.of(f"{name}-off", f"{off:+.2f}",
+                                     strain=100 * state["nominal_strain"]))  # fmt: skip
+    return keys
+
+
+def _response_cards(data: HomogenizationData | None) -> list[Card]:
+    if data is None:
+        return []
+    quantities = {"force_N_per_mm": ("force", "force per thickness [N/mm]"),
+                  "energy_N": ("energy", "stored energy per thickness [N]")}  # fmt: skip
+    response, first = data.found["response"], data.found["first_order_critical_strain"]
+    direct = data.direct.critical_strain
+    return [Card("Force and energy", [
+        ReportFigure(f"response-{name}", "",
+                     partial(figures.draw_response, data.path, direct, response, first, key, label))
+        for key, (name, label) in quantities.items()
+    ], wide=True, caption=text_of("homogenized-response"))]  # fmt: skip
+
+
+def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
+    state = None if data is None else (data.compared or (data.states[-1] if data.states else None))
+    if data is None or state is None or not state.amplitudes.shape[1]:
+        return []
+    v, fields = state.amplitudes[:, 0], {"homogenized": state.amplitudes[:, 0]}
+    if data.compared is not None and data.measured is not None:
+        v, measured = aligned(v, data.measured)
+        fields = {"homogenized": v, "measured in the images": np.where(np.isnan(v), v, measured)}
+    every = np.concatenate([values[np.isfinite(values)] for values in fields.values()])
+    scale = ColourScale.signed(every, "mm")
+    drawn = [
+        ReportFigure(f"amplitude-{k}", label,
+                     partial(figures.draw_amplitude, data.mesh, state.displacement, values, scale))
+        for k, (label, values) in enumerate(fields.items(), start=1)
+    ]  # fmt: skip
+    title = f"Amplitude v₁ at {100 * state.load:.4g} %"
+    return [Card(title, drawn, wide=True, caption=text_of("homogenized-fields"))]
+
+
+def _mode_cards(summary: Summary) -> list[Card]:
+    effects = summary["sensitivities"]
+    if not effects:
+        return []
+    rows = [_effect_row(effect) for effect in effects]
+    return Card.tabular(ReportTable.of("homogenized-effects", rows), wide=True)
+
+
+def _effect_row(effect: Mapping[str, Any]) -> Mapping[str, Any]:
+    sd = effect["sd_model_error"]
+    row = {"name": f"{effect['name']} [{effect['unit']}]", "value": f"{effect['value']:.5f}",
+           "noise": effect["sd_noise"], "model": sd}  # fmt: skip
+    if effect["snapped"]:
+        return row | {"critical": "0 (snapped)", "force": "0 (snapped)", "energy": "0 (snapped)"}
+    slopes = {
+        "critical": (effect["critical_strain"], 100.0),
+        "force": (effect["force"][-1], 1.0),
+        "energy": (effect["energy"][-1], 1.0),
+    }
+    known = {k: (slope, unit) for k, (slope, unit) in slopes.items() if slope is not None}
+    return row if sd is None else row | {k: unit * slope * sd for k, (slope, unit) in known.items()}

@@ -1,0 +1,173 @@
+"""What a homogenized specimen's run found: its fields, its summary, what the report shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from modeharvest.fem.field import Mesh, read_values, write_values
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.files import atomic_hdf5, open_hdf5
+from modeharvest.util.stages import versions
+from modeharvest.util.typed import to_plain
+from modeharvest.validation.homogenization import (
+    LatticeMode,
+    ModeParameters,
+    Response,
+    StateNumbers,
+)
+
+if TYPE_CHECKING:
+    from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
+    from modeharvest.fem.lattice.micromorphic.branches import Homogenized
+
+FORMAT = "modeharvest-homogenized-1"
+SIGNS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
+"""Of x and y in the quarters."""
+_REVERSED = [0, 3, 2, 1, 7, 6, 5, 4]
+"""The nodes of a Q8 element the other way round."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateFields:
+    """A state of the homogenized specimen on its macroscopic mesh."""
+
+    load: float
+    """Nominal strain [-]."""
+    displacement: FloatArray
+    amplitudes: FloatArray
+    """(n, 2) u [mm] and (n, m) v_i [mm], NaN where there is no lattice."""
+    strains: FloatArray
+    stresses: FloatArray
+    """(p, 4 + 3 m) F̄, v, g and P̄, Pi, Lambda at the points of the lattice, row by row."""
+
+
+def write_fields(found: Homogenized, body: HomogenizedBody, path: Path) -> None:
+    """Write mesh and states of the whole as HDF5, a group ``states/K`` each.
+
+    Of a quarter its mirror images are written too; its points stay those of the quarter.
+    """
+    signs = SIGNS if body.copies == len(SIGNS) else np.ones((1, 2))
+    with atomic_hdf5(path) as file:
+        file.attrs["format"] = FORMAT
+        write_values(file.create_group("mesh"), _unfolded(body.mesh, signs))
+        for k, state in enumerate(found.states):
+            u = np.concatenate([state.displacement * sign for sign in signs])
+            v = np.tile(state.amplitudes, (len(signs), 1))
+            fields = StateFields(state.load, u, v, state.strains, state.stresses)
+            write_values(file.create_group(f"states/{k:03d}"), fields)
+
+
+def _unfolded(mesh: Mesh, signs: FloatArray) -> Mesh:
+    """A mesh and its mirror images, one after the other; nodes on mirrors are there twice."""
+    nodes = np.concatenate([mesh.nodes * sign for sign in signs])
+    first = len(mesh.nodes) * np.arange(len(signs))
+    cells = [
+        (mesh.cells if sign.prod() > 0 else mesh.cells[:, _REVERSED]) + offset
+        for sign, offset in zip(signs, first, strict=True)
+    ]
+    return Mesh(nodes, np.concatenate(cells), mesh.element)
+
+
+def read_fields(path: Path) -> tuple[Mesh, tuple[StateFields, ...]]:
+    """What :func:`write_fields` wrote."""
+    with open_hdf5(path, "a homogenized specimen", form=FORMAT) as file:
+        states = file.get("states", {})
+        found = tuple(read_values(states[key], StateFields) for key in sorted(states))
+        return read_values(file["mesh"], Mesh), found
+
+
+def response_of(found: Homogenized) -> Response:
+    """The numbers of a followed specimen."""
+    states = tuple(StateNumbers(s.load, s.force, s.energy, s.branch) for s in found.states)
+    critical = found.critical
+    return Response(None if critical is None else critical.load, states, found.outcome)
+
+
+@dataclass(frozen=True, eq=False)
+class HomogenizationData:
+    """All that the report of a homogenized specimen shows."""
+
+    found: Mapping[str, Any]
+    """The content of ``homogenized.json``."""
+    direct: Response
+    """Of the direct simulation."""
+    path: Mapping[str, Any]
+    """``Solution.info["path"]`` of it."""
+    mode: LatticeMode | None
+    parameters: ModeParameters | None
+    """None where they were not given, or not measured."""
+    mesh: Mesh
+    states: Sequence[StateFields]
+    measured: FloatArray | None
+    measured_strain: float | None
+    """(n,) v of the measured mode at the mesh's nodes [mm], at which strain; None if there is none.
+    """
+    command: str
+
+    @property
+    def compared(self) -> StateFields | None:
+        """The homogenized state at the strain of the measured one."""
+        if self.measured_strain is None:
+            return None
+        near = [s for s in self.states if abs(s.load - self.measured_strain) < 1e-9]
+        return near[0] if near else None
+
+
+def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) -> dict[str, Any]:
+    """The content of ``summary.json``."""
+    found, response = data.found, data.found["response"]
+    mode = data.mode
+    return {
+        "title": title,
+        "case": dict(case),
+        "outcome": response["outcome"],
+        "critical_strain": response["critical_strain"],
+        "critical_strain_sd": response["critical_strain_sd"],
+        "criticals": found["criticals"],
+        "first_order_critical_strain": found["first_order_critical_strain"],
+        "states": response["states"],
+        "direct": to_plain({"critical_strain": data.direct.critical_strain,
+                            "states": data.direct.states}),
+        "mode": mode and to_plain({
+            "kind": case["mode"]["kind"], "wave_change": mode.wave_change, "waves": mode.snapped,
+        }),
+        "sensitivities": found["effects"],
+        "amplitude": _amplitude(data),
+        "rves": found["rves"],
+        "linearisations": found["linearisations"],
+        "files": {
+            "homogenized.h5": "mesh and states: u, v_i, generalised strains and stresses (HDF5)",
+            "homogenized.json": "critical strain, forces, energies, sensitivities",
+            "mode.json": "the mode as it was measured and snapped, with its covariances",
+            "experiment/": "the direct simulation, the images, and what was measured in them",
+        },
+        "versions": versions(),
+    }  # fmt: skip
+
+
+def _amplitude(data: HomogenizationData) -> dict[str, float] | None:
+    """Rms of the homogenized amplitude, of the measured one, and of their difference [mm]."""
+    state = data.compared
+    if state is None or data.measured is None:
+        return None
+    homogenized, measured = aligned(state.amplitudes[:, 0], data.measured)
+    there = np.isfinite(homogenized) & np.isfinite(measured)
+    a, b = homogenized[there], measured[there]
+    rms = {"homogenized_rms_mm": a, "measured_rms_mm": b, "difference_rms_mm": a - b}
+    return {"nominal_strain": state.load} | {
+        name: float(np.sqrt(np.mean(values**2))) for name, values in rms.items()
+    }
+
+
+def aligned(homogenized: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two amplitude fields (n,), the first with the sign of the second where both are known.
+
+    A pattern and its mirror image are one buckled state.
+    """
+    sign = -1.0 if float(np.nansum(homogenized * measured)) < 0.0 else 1.0
+    return sign * homogenized, measured

@@ -1,0 +1,237 @@
+"""Homogenized specimens from a case to a report: modes snapped, error bars, what is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from modeharvest.cli.root import main
+from modeharvest.fem.lattice.micromorphic.patterns import rotation_pattern
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.report.homogenization import homogenization_report
+from modeharvest.report.model import print_report
+from modeharvest.runs.homogenization.case import HomogenizationCase
+from modeharvest.runs.homogenization.pipeline import HomogenizationRun
+from modeharvest.runs.homogenization.results import aligned
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json
+from modeharvest.validation.homogenization import (
+    LatticeMode,
+    ModeParameters,
+    Response,
+    StateNumbers,
+    with_errors,
+)
+
+FloatArray = NDArray[np.float64]
+SPECIMENS = [Specimen(6, 10), Specimen(5, 4), Specimen(4, 7), Specimen(3, 3)]
+SMALL = """
+title = "A small specimen"
+[homogenization]
+mesh_size = 0.5
+[mode]
+kind = "measured"
+[experiment]
+strains = [0.03, 0.13]
+mesh_size = 0.5
+[experiment.specimen]
+holes_x = 4
+holes_y = 6
+diameter = 1.65
+[imaging]
+pixel_size = 0.03
+[correlation]
+v0_degree = 4
+v_degree = 3
+"""
+
+
+def cell_vectors(specimen: Specimen) -> FloatArray:
+    return 2.0 * specimen.pitch * np.eye(2)
+
+
+@pytest.mark.parametrize("specimen", SPECIMENS)
+def test_the_exact_mode_of_a_specimen_is_that_of_its_lattice(specimen: Specimen) -> None:
+    (mode,) = Ansatz.of_specimen(specimen).modes
+    found = LatticeMode.of(mode, mode.family.start, specimen, cell_vectors(specimen))
+    assert found.wave_change.max() < 1e-12
+    points = np.random.default_rng(0).uniform(-4, 4, (40, 2))
+    exact = rotation_pattern(specimen.pitch)(points)
+    ratio = np.sum(found.snapped(points) * exact) / np.sum(exact**2)
+    assert abs(ratio) == pytest.approx(mode.scale * 2.0, rel=1e-9)
+    np.testing.assert_allclose(found.snapped(points), ratio * exact, atol=1e-12)
+    np.testing.assert_allclose(found.measured(points), ratio * exact, atol=1e-12)
+
+
+@given(
+    st.lists(st.floats(-0.02, 0.02), min_size=4, max_size=4),
+    st.lists(st.floats(-0.1, 0.1), min_size=2, max_size=2),
+    st.floats(-0.2, 0.2),
+)
+def test_errors_of_waves_and_phases_are_snapped_away(
+    waves: list[float], phases: list[float], ratio: float
+) -> None:
+    specimen = Specimen(6, 10)
+    (mode,) = Ansatz.of_specimen(specimen).modes
+    start = mode.family.start
+    vectors = cell_vectors(specimen)
+    exact = LatticeMode.of(mode, start + np.array([ratio, 0, 0, 0, 0, 0, 0]), specimen, vectors)
+    off = start + np.array([ratio, *waves, *phases])
+    found = LatticeMode.of(mode, off, specimen, vectors)
+    assert found.is_same(exact)
+    k = math.pi / specimen.pitch * np.hypot(off[[1, 3]], off[[2, 4]])
+    np.testing.assert_allclose(np.linalg.norm(found.measured.vectors, axis=1), k)
+
+
+def test_a_wave_of_another_lattice_is_refused() -> None:
+    specimen = Specimen(6, 10)
+    (mode,) = Ansatz.of_specimen(specimen).modes
+    off = mode.family.start * [1, 1.3, 1, 1, 1, 1, 1]
+    with pytest.raises(InputError, match=r"within 10% of one that repeats on the cell"):
+        LatticeMode.of(mode, off, specimen, cell_vectors(specimen))
+
+
+class Linear:
+    """A response that is linear in the first amplitude of a mode."""
+
+    def __init__(self, reached: int = 2) -> None:
+        self.reached, self.calls = reached, 0
+        self.specimen = Specimen(6, 10)
+        (self.mode,) = Ansatz.of_specimen(self.specimen).modes
+        self.start = self.mode.family.start
+
+    def snapped(self, parameters: FloatArray) -> LatticeMode:
+        return LatticeMode.of(self.mode, parameters, self.specimen, cell_vectors(self.specimen))
+
+    def response(self, mode: LatticeMode) -> Response:
+        self.calls += 1
+        sizes = np.hypot(mode.snapped.sine, mode.snapped.cosine)
+        a1 = float(sizes[0, 0] / sizes[0, 1])
+        states = [StateNumbers(0.1 * k, 2.0 * k * a1, 3.0 * a1) for k in (1, 2)]
+        return Response(
+            0.1 + 0.01 * a1, tuple(states[: self.reached] if self.calls > 1 else states)
+        )
+
+
+def parameters(linear: Linear, sd: float) -> ModeParameters:
+    free, noise = np.diag([sd, *6 * [1e-3]]) ** 2, np.diag(7 * [1e-4]) ** 2
+    names = tuple(f"a{k + 1}" for k in range(7))
+    return ModeParameters(names, 5 * ("-",) + 2 * ("mm",), linear.start, noise, free)
+
+
+def test_error_bars_are_propagated_by_differences() -> None:
+    linear = Linear()
+    response = linear.response(linear.snapped(linear.start))
+    found, effects = with_errors(
+        response, parameters(linear, 0.02), linear.snapped, linear.response
+    )
+    assert linear.calls == 2, "one run for a1; the lattice says the other six"
+    assert found.critical_strain_sd == pytest.approx(0.01 * 0.02)
+    assert [s.force_sd_N_per_mm for s in found.states] == pytest.approx([2 * 0.02, 4 * 0.02])
+    assert [s.energy_sd_N for s in found.states] == pytest.approx([3 * 0.02] * 2)
+    assert [e.snapped for e in effects] == [False, *6 * [True]]
+    assert effects[0].force == pytest.approx((2.0, 4.0))
+    assert effects[0].sd_noise == pytest.approx(1e-4)
+
+
+def test_a_state_that_a_changed_mode_does_not_reach_has_no_error_bar() -> None:
+    linear = Linear(reached=1)
+    response = linear.response(linear.snapped(linear.start))
+    found, effects = with_errors(
+        response, parameters(linear, 0.02), linear.snapped, linear.response
+    )
+    assert found.states[0].force_sd_N_per_mm == pytest.approx(0.04)
+    assert found.states[1].force_sd_N_per_mm is None
+    assert effects[0].energy[1] is None
+
+
+def test_a_pattern_and_its_mirror_image_are_one() -> None:
+    v = np.array([1.0, 2.0, np.nan])
+    measured = np.array([-1.1, -1.9, 4.0])
+    np.testing.assert_array_equal(aligned(v, measured)[0], -v)
+    np.testing.assert_array_equal(aligned(-v, measured)[0], -v)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"experiment.specimen": {"stacking": "triangular"}}, "square stacking, got triangular"),
+        ({"experiment.specimen": {"grading_x": 0.001}}, "without grading, scatter and tilt"),
+        ({"mode": {"strain": 0.2}}, "expected a strain among"),
+        ({"mode": {"kind": "guessed"}}, "expected a mode kind among"),
+        ({"homogenization": {"mesh_size": 0.0}}, "mesh_size"),
+        ({"homogenization": {"centre": "ligament"}}, "centre"),
+        ({"homogenization": {"quater": True}}, "did you mean 'quarter'"),
+    ],
+)
+def test_what_can_not_be_homogenized_is_refused(
+    change: dict[str, dict[str, Any]], message: str, tmp_path: Path, capsys: Any
+) -> None:
+    lines = ["[homogenization]", "[mode]", "[experiment]", "[experiment.specimen]"]
+    for table, values in change.items():
+        at = lines.index(f"[{table}]") + 1
+        for key, value in values.items():
+            text = f'"{value}"' if isinstance(value, str) else str(value).lower()
+            lines.insert(at, f"{key} = {text}")
+    path = tmp_path / "case.toml"
+    path.write_text("\n".join(lines), "utf-8")
+    with pytest.raises(InputError, match=message):
+        HomogenizationCase.read(path)
+
+
+@pytest.mark.dolfinx
+@pytest.mark.usefixtures("coarse_pictures")
+def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    case, out = tmp_path / "small.toml", tmp_path / "out"
+    case.write_text(SMALL, "utf-8")
+    monkeypatch.setattr("sys.argv", ["modeharvest", "homogenize", str(case), "--out", str(out)])
+    main_exit(0)
+    summary = read_json(out / "summary.json")
+    assert "critical strain" in (out / "report.html").read_text("utf-8")
+    direct = summary["direct"]["critical_strain"]
+    # Four holes are few: docs/homogenization.md has the series over sizes.
+    assert summary["critical_strain"] == pytest.approx(direct, rel=0.15)
+    assert summary["first_order_critical_strain"] < 0.75 * direct
+    for state, exact in zip(summary["states"], summary["direct"]["states"], strict=True):
+        assert state["force_N_per_mm"] == pytest.approx(exact["force_N_per_mm"], rel=0.05)
+        assert state["energy_N"] == pytest.approx(exact["energy_N"], rel=0.05)
+    assert 0 < summary["critical_strain_sd"] < 0.02 * summary["critical_strain"]
+    assert [e["snapped"] for e in summary["sensitivities"]] == [False, *6 * [True]]
+    before = (out / "homogenized.json").stat().st_mtime_ns
+    again = HomogenizationRun(HomogenizationCase.read(case), out, source=str(case)).all()
+    assert again == summary
+    assert (out / "homogenized.json").stat().st_mtime_ns == before
+    print_report(homogenization_report(again), out)
+    assert "States, homogenized and direct" in capsys.readouterr().out
+
+
+def main_exit(code: int) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == code
+
+
+@pytest.mark.dolfinx
+@pytest.mark.usefixtures("coarse_pictures")
+def test_computed_modes_are_alternatives(tmp_path: Path) -> None:
+    found = []
+    for kind in ("analytic", "bloch"):
+        case = tmp_path / f"{kind}.toml"
+        case.write_text(SMALL.replace("measured", kind) + "fixed_mode = true", "utf-8")
+        out = tmp_path / kind
+        found.append(HomogenizationRun(HomogenizationCase.read(case), out).homogenize())
+    analytic, bloch = (content["response"]["critical_strain"] for content in found)
+    # The lattice's own mode has what Eq. (mode) leaves to w, which plates then hold less.
+    assert 0.85 * analytic < bloch < analytic
+    assert found[0]["effects"] == [] == found[1]["effects"]
+    assert not (tmp_path / "bloch" / "experiment").exists(), "no images are needed"

@@ -1,0 +1,217 @@
+"""Measured modes in homogenization: snapped to the lattice, and what their error bars do.
+
+A mode from images is the lattice's own but for errors: its wave vectors and phases are snapped to
+the lattice, because 1 % of a wave number makes ten of the critical strain. What is left of its
+errors, those of its amplitudes, is propagated to critical strain, forces and energies by
+differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from modeharvest.fem.field import Solution
+from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, snapped
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.modes import FourierMode
+from modeharvest.util.arrays import FloatArray
+
+_LEAST_STEP = 1e-3
+"""Of a parameter [-], [mm]: smaller differences would be rounding."""
+_SAME = 1e-9
+"""Of the largest amplitude: patterns closer than that are one."""
+
+
+@dataclass(frozen=True)
+class StateNumbers:
+    """A state of a specimen, homogenized or simulated directly."""
+
+    nominal_strain: float
+    """[-]."""
+    force_N_per_mm: float
+    """On the loaded edge, by thickness; compressive."""
+    energy_N: float
+    """Stored, by thickness."""
+    branch: str = "primary"
+    force_sd_N_per_mm: float | None = None
+    energy_sd_N: float | None = None
+    """Standard deviations by the mode's; None where it has none."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a specimen does under load."""
+
+    critical_strain: float | None
+    """[-]; None where nothing becomes unstable."""
+    states: tuple[StateNumbers, ...]
+    """At ascending strains."""
+    outcome: str = ""
+    """How far it was followed."""
+    critical_strain_sd: float | None = None
+
+    @property
+    def values(self) -> FloatArray:
+        """(1 + 2 states,) critical strain, forces and energies, in one row; NaN for none."""
+        critical = np.nan if self.critical_strain is None else self.critical_strain
+        rows = [(s.force_N_per_mm, s.energy_N) for s in self.states]
+        return np.concatenate([[critical], np.reshape(rows, (-1, 2)).T.ravel()])
+
+    def values_at(self, other: Response) -> FloatArray:
+        """The same at the strains of another one; NaN at those that this one did not reach."""
+        found = {s.nominal_strain: s for s in self.states}
+        lost = StateNumbers(np.nan, np.nan, np.nan)
+        states = tuple(found.get(s.nominal_strain, lost) for s in other.states)
+        return replace(self, states=states).values
+
+
+def direct_response(solution: Solution) -> Response:
+    """That of a direct simulation; of two states at a strain the buckled one counts."""
+    states = {}
+    for s in sorted(solution.snapshots, key=lambda s: s.branch != "primary"):
+        numbers = StateNumbers(s.nominal_strain, s.reaction, s.energy, s.branch)
+        states[s.nominal_strain] = numbers
+    critical: Mapping[str, Any] = solution.info.get("critical") or {}
+    ordered = tuple(states[strain] for strain in sorted(states))
+    return Response(critical.get("strain"), ordered, str(solution.info.get("outcome", "complete")))
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeMode:
+    """A mode of a specimen as a pattern of its infinite lattice."""
+
+    measured: PlaneWaves
+    """In the lattice's coordinates, a hole's centre at the origin, as it was found."""
+    snapped: PlaneWaves
+    """With wave vectors and phases of the lattice."""
+
+    @classmethod
+    def of(
+        cls, mode: FourierMode, parameters: ArrayLike, specimen: Specimen, vectors: ArrayLike
+    ) -> LatticeMode:
+        """Of a Fourier mode of a specimen; ``vectors`` (2, 2) of the RVE as rows [mm].
+
+        Phases are kept at the specimen's middle, where the origin is. InputError where a wave
+        vector is farther than a tenth from one that repeats on the RVE.
+        """
+        waves = mode.family.waves(parameters)
+        found = PlaneWaves.of_sines(waves, mode.half_wavelength, mode.scale)
+        hole = _central_hole(specimen)
+        moved = found.moved(-hole)
+        return cls(moved, snapped(moved, vectors, about=-hole, inversion_centre=(0.0, 0.0)))
+
+    @property
+    def wave_change(self) -> FloatArray:
+        """(w,) changes of the wave vectors by snapping, over their lengths [-]."""
+        k, to = self.measured.vectors, self.snapped.vectors
+        return np.asarray(np.linalg.norm(to - k, axis=1) / np.linalg.norm(k, axis=1))
+
+    def is_same(self, other: LatticeMode) -> bool:
+        """Whether snapping has made one pattern of both."""
+        size = float(max(np.abs(self.snapped.sine).max(), np.abs(self.snapped.cosine).max()))
+        parts = ("vectors", "cosine", "sine")
+        off = [np.abs(getattr(self.snapped, n) - getattr(other.snapped, n)).max() for n in parts]
+        return bool(off[0] <= _SAME and max(off[1:]) <= _SAME * size)
+
+
+def _central_hole(specimen: Specimen) -> FloatArray:
+    """(2,) centre of the hole next to the specimen's middle, the first of several [mm]."""
+    centres = specimen.hole_centres
+    return np.asarray(centres[int(np.argmin(np.linalg.norm(centres, axis=1)))])
+
+
+@dataclass(frozen=True, eq=False)
+class ModeParameters:
+    """The parameters of a measured mode with their covariances, whose names they have."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: FloatArray
+    """(m,)."""
+    by_noise: FloatArray
+    by_model_error: FloatArray
+    """(m, m) covariances by noise, and by the residual cell by cell, noise included; NaN where
+    they are not known."""
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> ModeParameters:
+        """From plain values."""
+        names, units = tuple(content["names"]), tuple(content["units"])
+        keys = ("values", "by_noise", "by_model_error")
+        return cls(names, units, *(np.array(content[key], dtype=np.float64) for key in keys))
+
+
+@dataclass(frozen=True)
+class ParameterEffect:
+    """What a parameter of the mode does to the response."""
+
+    name: str
+    unit: str
+    value: float
+    sd_noise: float | None
+    sd_model_error: float | None
+    """Of the parameter, by its two causes."""
+    snapped: bool
+    """Whether snapping to the lattice has taken away all that the parameter does."""
+    critical_strain: float | None
+    force: tuple[float | None, ...]
+    energy: tuple[float | None, ...]
+    """Derivatives of the critical strain and of each state's force [N/mm] and energy [N]; None
+    where the specimen with the parameter changed did not come so far."""
+
+
+def with_errors(
+    response: Response,
+    parameters: ModeParameters,
+    mode: Callable[[FloatArray], LatticeMode],
+    predicted: Callable[[LatticeMode], Response],
+) -> tuple[Response, tuple[ParameterEffect, ...]]:
+    """Propagate the standard deviations of a mode's parameters to the response.
+
+    response : with the parameters themselves.
+    mode : from parameters (m,), snapped.
+    predicted : the response with a mode; called once for each parameter that snapping leaves.
+    """
+    m, here = len(parameters.values), mode(parameters.values)
+    J, is_snapped = np.zeros((len(response.values), m)), np.zeros(m, bool)
+    sds = [np.sqrt(np.diag(C)) for C in (parameters.by_noise, parameters.by_model_error)]
+    for k in range(m):
+        size = [sd[k] for sd in sds if np.isfinite(sd[k])]
+        step = np.zeros(m)
+        step[k] = max(_LEAST_STEP, *size)
+        there = mode(parameters.values + step)
+        is_snapped[k] = here.is_same(there)
+        if not is_snapped[k]:
+            J[:, k] = (predicted(there).values_at(response) - response.values) / step[k]
+    covariance, count = np.nan_to_num(parameters.by_model_error), len(response.states)
+    every = [_known(sd) for sd in np.sqrt(np.einsum("ik,kl,il->i", J, covariance, J))]
+    states = tuple(
+        replace(s, force_sd_N_per_mm=force, energy_sd_N=energy)
+        for s, force, energy in zip(
+            response.states, every[1 : 1 + count], every[1 + count :], strict=True
+        )
+    )
+    effects = tuple(
+        ParameterEffect(
+            name=parameters.names[k],
+            unit=parameters.units[k],
+            value=float(parameters.values[k]),
+            sd_noise=_known(sds[0][k]),
+            sd_model_error=_known(sds[1][k]),
+            snapped=bool(is_snapped[k]),
+            critical_strain=_known(J[0, k]),
+            force=tuple(map(_known, J[1 : 1 + count, k])),
+            energy=tuple(map(_known, J[1 + count :, k])),
+        )
+        for k in range(m)
+    )
+    return replace(response, states=states, critical_strain_sd=every[0]), effects
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
