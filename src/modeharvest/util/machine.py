@@ -12,8 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import psutil
-
 from modeharvest.util.errors import InputError
 
 _CGROUPS = Path("/sys/fs/cgroup")
@@ -25,6 +23,8 @@ _UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 def available_bytes() -> float:
     """Memory that this process may still take [bytes]: the machine's, or its container's."""
+    import psutil  # not before: it would be a tenth of what the command line takes to start
+
     return min(float(psutil.virtual_memory().available), *map(_left_in, _own_cgroups()))
 
 
