@@ -97,7 +97,7 @@ class Comparison:
         """(rows, cols, 2) truth - best fit [mm]: the model (ansatz) error."""
         return _difference(self.displacement, self.best.displacement())
 
-    @cached_property
+    @property
     def idic_to_best(self) -> FloatArray:
         """(rows, cols, 2) IDIC - best fit [mm]: the measurement error; NaN off the mask."""
         return self.best_error - self.w
