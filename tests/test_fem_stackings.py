@@ -34,6 +34,8 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run, require_same_experiment
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies.study import ImagePairSpec
@@ -97,6 +99,24 @@ def test_a_triangular_specimen_from_simulation_to_report(tmp_path: Path) -> None
         assert f'id="phi{i}-1000"' in page
     assert "seven parameters" not in page
     assert "four holes" not in page
+
+
+def test_photographs_of_a_rectangular_stacking_need_the_shorter_distance(tmp_path: Path) -> None:
+    specimen = replace(RECTANGULAR, pitch_y=2.5, diameter_y=2.1)
+    solution = simulate(Experiment(specimen, strains=(0.14,), mesh_size=0.35))
+    make_images(solution, IMAGING, tmp_path)
+    (tmp_path / "experiment.toml").write_text(
+        '[images]\nreference = "reference_8bit.tif"\ndeformed = ["deformed_1400_8bit.tif"]\n'
+        "[scale]\npixel_size = 0.04\n[specimen]\ncell_size = 1.9\n"
+        "[correlation]\nv0_degree = 4\nv_degree = 3\n"
+    )
+    case = PhotographCase.read(tmp_path / "experiment.toml")
+    (measured,) = HarvestRun(case, tmp_path / "out").results().values()
+    assert measured.result.outcome is Outcome.CONVERGED
+    (mode,) = measured.result.ansatz.modes
+    waves = mode.family.waves(measured.result.mode_parameters(0))
+    # The lattice's own, by the vectors of its holes, as those of the virtual experiment above.
+    np.testing.assert_allclose(np.abs(waves[:, 2:4]), [[1.0, 1.9 / 2.5]] * 2, atol=0.05)
 
 
 @pytest.mark.parametrize("specimen", [RECTANGULAR, TRIANGULAR])

@@ -152,6 +152,16 @@ def test_a_wrong_cell_size_is_contradicted(factor: float) -> None:
         lattice_of(holes, cell_px=190.0 * factor)
 
 
+def test_the_cell_size_of_a_rectangular_lattice_is_its_shorter_distance() -> None:
+    holes = holes_at(lattice_points(np.diag([190.0, 250.0]), (6, 10)))
+    found = lattice_of(holes, cell_px=190.0)
+    assert found.kind == "rectangular"
+    np.testing.assert_allclose(np.sort(np.linalg.norm(found.vectors, axis=1)), [190.0, 250.0])
+    for wrong in (220.0, 250.0):  # their mean, too
+        with pytest.raises(InputError, match=r"expected a cell size near 190\.0 px"):
+            lattice_of(holes, cell_px=wrong)
+
+
 def bent(points: FloatArray, strain: float, shift: float) -> FloatArray:
     """Compressed along the columns most in the middle, bulging, moved (row, col) [px]."""
     middle = points.mean(axis=0)

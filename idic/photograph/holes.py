@@ -257,12 +257,12 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
         kind=_kind(vectors),
         too_small=holes.too_small,
     )
-    off = 0.0 if cell_px is None else cell_px / found.pitch_px - 1.0
+    apart = float(np.linalg.norm(vectors, axis=1).min())
+    off = 0.0 if cell_px is None else cell_px / apart - 1.0
     if cell_px is not None and (not cell_px > 0 or abs(off) > _WRONG_CELL):
         raise InputError(
-            f"expected a cell size near {found.pitch_px:.1f} px, the distance of the holes in "
-            f"the image, got {cell_px:.1f} px ({100 * off:+.0f} %); correct the cell size or the "
-            "pixel size"
+            f"expected a cell size near {apart:.1f} px, the distance of neighbouring holes in the "
+            f"image, got {cell_px:.1f} px ({100 * off:+.0f} %); correct the cell size or pixel size"
         )
     return found
 
