@@ -57,8 +57,8 @@ from modeharvest.validation.homogenization import (
 
 if TYPE_CHECKING:
     from modeharvest.fem.lattice.cells import UnitCell
-    from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
     from modeharvest.fem.lattice.micromorphic.branches import Homogenized
+    from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
 
 _CRITICAL = "load kind negative_before negative_after"
 

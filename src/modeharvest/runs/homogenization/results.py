@@ -22,8 +22,8 @@ from modeharvest.validation.homogenization import (
 )
 
 if TYPE_CHECKING:
-    from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
     from modeharvest.fem.lattice.micromorphic.branches import Homogenized
+    from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
 
 FORMAT = "modeharvest-homogenized-1"
 SIGNS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
