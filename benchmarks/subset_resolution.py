@@ -1,4 +1,4 @@
-"""A local DIC on the star of DIC Challenge 2.0: what theory says of its subsets, and what it does.
+"""DIC on the star of DIC Challenge 2.0, by subsets or finite elements: theory, and what is found.
 
 pyvale, or whatever ``MODEHARVEST_PYVALE`` names (docs/fields.md), measures the star with subsets of
 several sizes; its fields are graded as anybody's. Theory: l10 by Savitzky and Golay's weights, and
@@ -9,6 +9,12 @@ for an affine subset of w x w px, more for a quadratic one. Both take the speckl
 isn't: a correlation weighs each pixel of a subset by its gradient ("this speckle"), which is the
 pattern-induced bias; such fits to the true displacement are graded, too.
 
+With ``--cutoffs`` it is the whole displacement instead of subsets, for cut-off wavelengths l, or
+the one that it finds by itself in the deformed image ("found"); the image without motion is
+measured with the same. Theory of its smoothing, T = 1/(1 + (l/p)^6):
+
+    l10 = 9^(1/6) l,    n = sqrt(2) s/(l G) sqrt(4 pi^2/(9 sqrt(3))).
+
 ``python benchmarks/subset_resolution.py`` (2 minutes of processor time; --out keeps all files).
 """
 
@@ -16,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -25,6 +32,7 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve, savgol_coeffs
 
 from modeharvest.idic.chebyshev import orders
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.idic.local.subsets import SubsetOptions, subset_field
 from modeharvest.imaging.pair import ImagePair
@@ -51,6 +59,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--widths", type=int, nargs="+", default=[11, 17, 25])
     parser.add_argument("--shapes", nargs="+", default=["affine"], choices=list(DEGREES))
+    parser.add_argument("--cutoffs", nargs="+", help='of the whole displacement [px], or "found"')
+    parser.add_argument("--elements", type=float, default=24.0, help="edge length of its [px]")
     parser.add_argument("--noise", type=float, default=0.01)
     parser.add_argument("--band", type=int, default=40, help="rows beside the centre row")
     parser.add_argument("--step", type=int, default=5)
@@ -63,6 +73,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         out = options.out or Path(name)
         star_set = make_star_set(StarSpec(noise=(options.noise,)), out / "star")
+        if options.cutoffs:
+            grade_whole(star_set, options)
+            return
         grades = {
             (shape, width): grade(star_set, shape, width, options)
             for shape in options.shapes
@@ -96,6 +109,60 @@ def grade(star_set: StarSet, shape: str, width: int, options: argparse.Namespace
         write_field(star_set.folder.parent / "fields" / f"{shape}_{width}_{role}.csv", named)
         fields.append(named)
     return StarGrade(star, *fields)
+
+
+MARGIN_PX = 100
+"""Of rows that are measured beside those that are graded, where the body's edges are; half of it
+along the image's ends."""
+
+
+def grade_whole(star_set: StarSet, options: argparse.Namespace) -> None:
+    """Measure the whole displacement with and without motion, and print what it resolves."""
+    star = star_set.spec.star
+    rows = slice(star.centre_row - options.band, star.centre_row + options.band + 1, options.step)
+    row, col = np.mgrid[rows, MARGIN_PX // 2 : star.cols - MARGIN_PX // 2 : options.step]
+    mask = np.zeros((star.rows, star.cols), dtype=np.bool_)
+    reach = options.band + MARGIN_PX
+    mask[star.centre_row - reach : star.centre_row + reach + 1] = True
+    f, moved, still = (
+        read_image(star_set.folder / image_name(role, options.noise))
+        for role in ("reference", "deformed", "still")
+    )
+    how = FiniteElementOptions(options.elements, min(12.0, options.elements))
+    body = how.body(mask, star.grid)
+    slope = float(np.sqrt(np.mean(slopes(star_set)[0] ** 2)))
+    level = np.sqrt(2.0) * np.hypot(options.noise, _rounding(star_set)) / slope
+    print("| ℓ [px] | l10 [px] | theory | n [10⁻³ px] | theory | n l10 [px²] | theory |")
+    print("|---" * 7 + "|")
+    for wanted in options.cutoffs:
+        cutoff, fields = None if wanted == "found" else float(wanted), []
+        for g in (moved, still):
+            found = measure_displacement(
+                ImagePair(f, g, star.grid, mask), np.zeros_like, body,
+                options=replace(how, cutoff_px=cutoff),
+            )  # fmt: skip
+            cutoff, u = found.cutoff_px, found.displacement_on()[row, col].reshape(-1, 2)
+            x, y = star.grid.to_mm(row.ravel(), col.ravel())
+            fields.append(LocalField(x, y, u, source=f"l = {wanted}"))
+        graded = StarGrade(star, *fields)
+        assert graded.noise is not None
+        assert cutoff is not None
+        at, n = graded.attenuation, graded.noise
+        finest, floor = 9.0 ** (1.0 / 6.0) * cutoff, level / cutoff * FLOOR
+        cells = [
+            f"{cutoff:.1f}" + " (found)" * (wanted == "found"),
+            f"{at.finest_px:.1f} ± {at.finest_se_px:.1f}",
+            f"{finest:.1f}",
+            f"{1e3 * n.v_px:.2f} ± {1e3 * n.v_se_px:.2f}",
+            f"{1e3 * floor:.2f}",
+            f"{graded.indicator_px2:.3f} ± {graded.indicator_se_px2:.3f}",
+            f"{floor * finest:.3f}",
+        ]
+        print(f"| {' | '.join(cells)} |", flush=True)
+
+
+FLOOR = float(np.sqrt(4.0 * np.pi**2 / (9.0 * np.sqrt(3.0))))
+"""Root of the integral of T^2 over all wave vectors, times l [-]."""
 
 
 def grade_filters(shapes: list[str], widths: list[int]) -> None:
@@ -171,6 +238,11 @@ def weighted(star_set: StarSet, degree: int, width: int, at: LocalField) -> Loca
     return LocalField(at.x, at.y, u, sd=np.column_stack([sd, sd]), source="weighted")
 
 
+def _rounding(star_set: StarSet) -> float:
+    """Standard deviation of what rounding to so many bits does, of full scale."""
+    return float(1.0 / np.sqrt(12.0) / (2**star_set.spec.bits - 1))
+
+
 def row(star_set: StarSet, shape: str, width: int, noise: float, graded: StarGrade) -> str:
     """A row of the table."""
     star, degree = star_set.spec.star, DEGREES[shape]
@@ -178,8 +250,7 @@ def row(star_set: StarSet, shape: str, width: int, noise: float, graded: StarGra
     fitted = weighted(star_set, degree, width, graded.moved)
     here = Attenuation.of(star, fitted)
     slope = float(np.sqrt(np.mean(slopes(star_set)[0] ** 2)))
-    rounding = 1.0 / np.sqrt(12.0) / (2**star_set.spec.bits - 1)
-    both = np.sqrt(2.0) * np.hypot(noise, rounding)
+    both = np.sqrt(2.0) * np.hypot(noise, _rounding(star_set))
     floor = both / slope * subset_noise(width, degree)
     found = graded.attenuation
     assert graded.noise is not None

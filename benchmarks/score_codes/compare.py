@@ -1,10 +1,11 @@
-"""Three DIC codes from PyPI and micromorphic IDIC on one benchmark, scored and ranked.
+"""Three DIC codes from PyPI, the whole displacement and micromorphic IDIC on a benchmark, scored.
 
-Run: benchmarks/score_codes/run [--pixel-size 0.02] [--strain 0.128] [--only CODE ...]
+Run: benchmarks/score_codes/run [--specimen paper|plate] [--pixel-size 0.02] [--strain 0.128]
+     [--only CODE ...]
 
 Each code gets the public folder and nothing else: the 8-bit images, the mask, benchmark.json. Each
 returns a file, as anybody's would be, and 'modeharvest score' grades the files. All of it stays in
-out/score_codes, with the report.
+out/score_codes, with the report. The specimens: the paper's, with 60 holes, and a plate with one.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import time
 from collections.abc import Callable
@@ -21,10 +23,15 @@ from typing import Any
 
 import numpy as np
 
+from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.finite_element.files import read_result
+from modeharvest.idic.finite_element.measure import measure_displacement
+from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.idic.local.subsets import WHERE, SubsetOptions, subset_field
+from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
@@ -33,6 +40,7 @@ from modeharvest.report.grades import grading_report
 from modeharvest.report.model import print_report
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
 from modeharvest.runs.case import Case, shipped_solution
+from modeharvest.runs.measure import measure
 from modeharvest.util.errors import InputError, MissingDependencyError
 
 HERE = Path(__file__).resolve().parent
@@ -48,6 +56,8 @@ class Task:
 
     public: Path
     image: str
+    mask_image: str
+    reference_image: str
     reference: np.ndarray
     deformed: np.ndarray
     mask: np.ndarray
@@ -59,13 +69,14 @@ class Task:
         """Of a public folder."""
         info: dict[str, Any] = json.loads((public / "benchmark.json").read_text("utf-8"))
         (entry,) = (d for d in info["deformed"] if abs(d["nominal_strain"] - strain) < 1e-9)
-        first = info["first_pixel_mm"]
-        grid = PixelGrid(info["rows"], info["cols"], info["pixel_size_mm"], first["x"],
-                         first["y_up"])  # fmt: skip
-        f, g = (255.0 * read_image(public / name)
-                for name in (info["reference"]["camera_image"], entry["camera_image"]))  # fmt: skip
-        mask = read_mask(public / info["reference"]["mask"])
-        return cls(public, entry["camera_image"], f, g, mask, grid, strain)
+        corner = info["first_pixel_mm"]
+        grid = PixelGrid(info["rows"], info["cols"], info["pixel_size_mm"], corner["x"],
+                         corner["y_up"])  # fmt: skip
+        first, second = info["reference"]["camera_image"], entry["camera_image"]
+        f, g = (255.0 * read_image(public / name) for name in (first, second))
+        masked = info["reference"]["mask"]
+        mask = read_mask(public / masked)
+        return cls(public, second, masked, first, f, g, mask, grid, strain)
 
     @property
     def pair(self) -> ImagePair:
@@ -78,16 +89,46 @@ class Task:
         return np.asarray(self.deformed > 25)
 
 
-def idic(task: Task, field: Path, codes: str) -> None:
+def correlated(task: Task) -> Result:
     """Micromorphic IDIC with the paper's ansatz and start: it knows where the holes are."""
     how = SquareLatticeOptions()
     ansatz = how.ansatz(Specimen())
     guess = ansatz.initial_guess(task.strain, how.start_amplitude)
-    found = correlate(task.pair, ansatz, guess=guess, options=how.options())
+    return correlate(task.pair, ansatz, guess=guess, options=how.options())
+
+
+def idic(task: Task, field: Path, codes: str) -> None:
+    """The ansatz alone."""
+    found = correlated(task)
     step, grid = STEP_PX, task.grid
     row, col = np.mgrid[step // 2 : grid.rows : step, step // 2 : grid.cols : step]
     row, col = (i[task.mask[row, col]] for i in (row, col))
     write_field(field, LocalField(*grid.to_mm(row, col), found.displacement()[row, col]))
+
+
+def whole(task: Task, field: Path, codes: str) -> None:
+    """The whole displacement from the ansatz' result on, as 'modeharvest run --whole-field'."""
+    _write(task, field, measure_displacement(task.pair, correlated(task)))
+
+
+def _write(task: Task, field: Path, found: NodalResult) -> None:
+    """At every pixel of the material."""
+    row, col = np.nonzero(task.mask)
+    write_field(field, LocalField(*task.grid.to_mm(row, col), found.displacement_on()[row, col]))
+
+
+def measured(task: Task, field: Path, codes: str) -> None:
+    """The whole displacement as 'modeharvest measure' gives it for any images and their mask.
+
+    No law, no lattice, no mode is known to it, nor where the deformed image shows material.
+    """
+    folder, pixel_size = field.parent / "measure", task.grid.pixel_size
+    shutil.rmtree(folder, ignore_errors=True)
+    reference, image, mask = (
+        task.public / name for name in (task.reference_image, task.image, task.mask_image)
+    )
+    measure(reference, [image], folder, mask=mask, pixel_size=pixel_size)
+    _write(task, field, read_result(folder / f"results/{image.stem}.h5"))
 
 
 def pyvale(filling: float) -> Callable[[Task, Path, str], None]:
@@ -123,6 +164,8 @@ def other(script: str) -> Callable[[Task, Path, str], None]:
 
 
 CODES: dict[str, Callable[[Task, Path, str], None]] = {
+    "whole displacement": whole,
+    "whole displacement, by measure": measured,
     "micromorphic IDIC, 77 unknowns": idic,
     "pyvale": pyvale(filling=1.0),
     "pyvale, partial subsets": pyvale(filling=0.7),
@@ -131,20 +174,34 @@ CODES: dict[str, Callable[[Task, Path, str], None]] = {
 }
 
 
+PLATE = Experiment(
+    Specimen(1, 1, diameter=6.0, pitch=12.0, bulk_x=4.0, bulk_y=2.0),
+    strains=(0.06,),
+    mesh_size=0.25,
+)
+"""A plate with a hole, 20 x 16 mm."""
+SPECIMENS = {"paper": 0.128, "plate": 0.06}
+"""With the nominal strain at which they are measured."""
+
+
 def main() -> None:
     arguments = _arguments()
-    case = Case.read("paper-virtual")
+    case, is_plate = Case.read("paper-virtual"), arguments.specimen == "plate"
+    imaging = replace(case.imaging, pixel_size=arguments.pixel_size)
     case = case.model_copy(
-        update={"imaging": replace(case.imaging, pixel_size=arguments.pixel_size)}
+        update={"imaging": imaging, **({"experiment": PLATE} if is_plate else {})}
     )
-    public = OUT / "set"
-    solution = shipped_solution("paper-virtual")
+    out = OUT / arguments.specimen
+    public = out / "set"
+    solution = None if is_plate else shipped_solution("paper-virtual")
     info = make_benchmark(case, public, solution=solution)
-    task = Task.read(public, arguments.strain)
+    task = Task.read(public, arguments.strain or SPECIMENS[arguments.specimen])
     print(f"benchmark {info['id']}: {task.grid.rows} x {task.grid.cols} px")
     fields: list[Path] = []
     for name in arguments.only or CODES:
-        field = OUT / "fields" / f"{name}.csv"
+        if CODES[name] in (idic, whole) and is_plate:
+            continue  # one hole has no pattern
+        field = out / "fields" / f"{name}.csv"
         begin = time.perf_counter()
         try:
             CODES[name](task, field, arguments.codes)
@@ -153,8 +210,8 @@ def main() -> None:
             continue
         print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
         fields.append(field)
-    graded = OUT / "graded"
-    done = score(fields, truth_folder(public), arguments.strain, graded)
+    graded = out / "graded"
+    done = score(fields, truth_folder(public), task.strain, graded)
     print_report(grading_report(done), graded)
 
 
@@ -163,8 +220,9 @@ def _arguments() -> argparse.Namespace:
         prog="benchmarks/score_codes/run", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
+    parser.add_argument("--specimen", choices=list(SPECIMENS), default="paper")
     parser.add_argument("--pixel-size", type=float, default=0.02, help="[mm/px]")
-    parser.add_argument("--strain", type=float, default=0.128, help="0.078 or 0.128")
+    parser.add_argument("--strain", type=float, help="of the paper's: 0.078 or 0.128")
     parser.add_argument("--only", nargs="+", choices=list(CODES), help="only these codes")
     parser.add_argument("--codes", required=True, help=argparse.SUPPRESS)
     return parser.parse_args()

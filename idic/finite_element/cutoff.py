@@ -49,8 +49,7 @@ _LEAST_PX, _MOST_PX = 6.0, 400.0
 _STRONGER = 4.0
 """Weight of the regularisation that shows its bias, over the weight used [-]."""
 _OF_SLOPES = 2.0
-"""Bias of gradients over what that shows: waves that are gone, half of it in a spectrum k^-3.5,
-can't change."""
+"""Bias of gradients over what that shows: waves that are gone (half, in k^-3.5) can't change."""
 _SIGNIFICANT = 3.0
 """Standard deviations."""
 

@@ -356,8 +356,7 @@ class _Measurement:
     def _noise_in(self, at: Linearised) -> FloatArray:
         """(m,) variance of noise in each element's gradient, over that of the residual's [-].
 
-        That of f has nothing to do with its own slopes, so only their signal counts; g's counts
-        with all, and by 1/det F at the long wavelengths of which displacements are made.
+        f's has nothing to do with its own slopes: only their signal counts; g's goes by 1/det F.
         """
         u, det = self.u.reshape(-1, 2)[self.body.mesh.cells], self._deformation_gradient()
         det = np.maximum(determinant(det), _LEAST_DET)

@@ -49,10 +49,11 @@ _FAR_PX = 4 * REACH_PX
 """How far blocks are looked for where they aren't near."""
 _ENOUGH = 0.9
 """Share of blocks that are near, unless some have gone far."""
-_CLOSE_PX = 4.0
+_CLOSE_PX = 1.5
 """What a polynomial may leave of nine tenths of the blocks' motion."""
-_DENSER = 5
-"""Times as many blocks where it leaves more."""
+_DENSER = 5, 16
+"""Times as many blocks, in turn, that are asked: the widest places are junctions, which only turn.
+"""
 _STRAY = 8.0
 """Times the spread of its neighbours' motion that a block may be off their median."""
 _FIRST = FiniteElementOptions(edge_px=4)
@@ -125,22 +126,20 @@ def block_motion(
     (n, 2); where that isn't close to them, a spline through more of them takes its place.
     InputError if they aren't found.
     """
-    match = _matched(pair, mesh, known, REACH_PX)
-    if match.share < _ENOUGH:
-        match = _matched(pair, mesh, known, _FAR_PX)
+    match = _matched(pair, mesh, known, BLOCKS)
     require_same_surface(match, *names)
     added = match.in_mm(pair.grid).less(_at_nearest(mesh, known))
-    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    slow, _ = first_motion(Box(low[0], high[0], low[1], high[1]), pair, added)
+    slow, _ = first_motion(Box(*np.quantile(mesh.nodes, [0, 1], axis=0).T.ravel()), pair, added)
     known = known + slow(mesh.nodes)
-    left = match.in_mm(pair.grid).less(_at_nearest(mesh, known))
-    if np.quantile(np.linalg.norm(left.u, axis=1), 0.9) < _CLOSE_PX * pair.grid.pixel_size:
-        return known
-    dense = _matched(pair, mesh, known, _FAR_PX, _DENSER * BLOCKS)
-    left = dense.in_mm(pair.grid).less(_at_nearest(mesh, known))
-    keep = _like_neighbours(left, pair.grid.pixel_size)
-    spline = RBFInterpolator(left.points[keep], left.u[keep], neighbors=30)
-    return np.asarray(known + spline(mesh.nodes))
+    for times in _DENSER:
+        dense = _matched(pair, mesh, known, times * BLOCKS)
+        left = dense.in_mm(pair.grid).less(_at_nearest(mesh, known))
+        if np.quantile(np.linalg.norm(left.u, axis=1), 0.9) < _CLOSE_PX * pair.grid.pixel_size:
+            break
+        keep = _like_neighbours(left, pair.grid.pixel_size)
+        spline = RBFInterpolator(left.points[keep], left.u[keep], neighbors=30)
+        known = known + spline(mesh.nodes)
+    return known
 
 
 def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:
@@ -156,11 +155,11 @@ def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:
     return np.asarray(off < _STRAY * (spread + pixel_size))
 
 
-def _matched(
-    pair: ImagePair, mesh: Mesh, u: FloatArray, reach_px: int, count: int = BLOCKS
-) -> BlockMatch:
+def _matched(pair: ImagePair, mesh: Mesh, u: FloatArray, count: int) -> BlockMatch:
     """Blocks, looked for around where displacements u (n, 2) of the nodes [mm] take them."""
-    return match_blocks(pair, expected_by(_at_nearest(mesh, u), pair.grid), reach_px, count)
+    expected = expected_by(_at_nearest(mesh, u), pair.grid)
+    near = match_blocks(pair, expected, REACH_PX, count)
+    return near if near.share >= _ENOUGH else match_blocks(pair, expected, _FAR_PX, count)
 
 
 def _at_nearest(mesh: Mesh, u: FloatArray) -> Slow:

@@ -294,8 +294,9 @@ def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
     tiles = room[: rows * cell, : cols * cell].reshape(rows, cell, cols, cell).swapaxes(1, 2)
     flat = tiles.reshape(rows, cols, -1)
     widest, where = flat.max(axis=-1), flat.argmax(axis=-1)
-    half = min(BLOCK_PX // 2, int(np.quantile(widest[widest > 0], 0.5)) - 1 if widest.any() else 0)
-    if half < SMALLEST_PX // 2:
+    half = int(np.quantile(widest[widest > 0], 0.5)) - 1 if widest.any() else 0
+    half = min(BLOCK_PX // 2, max(half, SMALLEST_PX // 2))
+    if widest.max(initial=0) <= half:
         raise InputError(
             f"expected room for blocks of {SMALLEST_PX} px on the material, got ligaments "
             f"narrower than that or an image of {material.shape} px; check the mask"
