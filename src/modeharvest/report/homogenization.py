@@ -150,9 +150,9 @@ def _response_cards(data: HomogenizationData | None) -> list[Card]:
 
 
 def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
-    state = None if data is None else (data.compared or (data.states[-1] if data.states else None))
-    if data is None or state is None or not state.amplitudes.shape[1]:
+    if data is None or not data.fields.states:
         return []
+    state, mesh = data.compared or data.fields.states[-1], data.fields.mesh
     v, fields = state.amplitudes[:, 0], {"homogenized": state.amplitudes[:, 0]}
     if data.compared is not None and data.measured is not None:
         v, measured = aligned(v, data.measured)
@@ -161,11 +161,21 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
     scale = ColourScale.signed(every, "mm")
     drawn = [
         ReportFigure(f"amplitude-{k}", label,
-                     partial(figures.draw_amplitude, data.mesh, state.displacement, values, scale))
+                     partial(figures.draw_amplitude, mesh, state.displacement, values, scale))
         for k, (label, values) in enumerate(fields.items(), start=1)
     ]  # fmt: skip
-    title = f"Amplitude v₁ at {100 * state.load:.4g} %"
-    return [Card(title, drawn, wide=True, caption=text_of("homogenized-fields"))]
+    at, points = f"at {100 * state.load:.4g} %", data.fields.points
+    places = [np.argmin(points @ sign) for sign in np.array([(1, 1), (-1, 1), (1, -1), (-1, -1)])]
+    rves = [
+        ReportFigure(
+            f"rve-{k}", f"at ({points[n, 0]:.2f}, {points[n, 1]:.2f}) mm",
+            partial(figures.draw_microstructure, data.fields.rve, state.microstructure[n]),
+        )
+        for k, n in enumerate(dict.fromkeys(places), start=1)
+    ]  # fmt: skip
+    text = (text_of(f"homogenized-{name}") for name in ("fields", "microstructure"))
+    return [Card(f"Amplitude v₁ {at}", drawn, wide=True, caption=next(text)),
+            Card(f"Microstructure {at}", rves, wide=True, caption=next(text))]  # fmt: skip
 
 
 def _mode_cards(summary: Summary) -> list[Card]:

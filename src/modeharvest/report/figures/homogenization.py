@@ -13,9 +13,10 @@ from matplotlib.tri import Triangulation
 
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.mapping.elements import shape_functions
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above, ring
-from modeharvest.report.figures.maps import ColourScale, bare_axes, colour_bar
-from modeharvest.report.figures.style import BLUE, GREEN, MUTED, RED
+from modeharvest.report.figures.maps import WIDTH, ColourScale, bare_axes, colour_bar
+from modeharvest.report.figures.style import BLUE, EDGE, GREEN, MUTED, RED, draw_path
 from modeharvest.util.arrays import FloatArray, IntArray
 
 _FINE = 8
@@ -86,6 +87,18 @@ def draw_amplitude(
                    cmap=scale.colours, norm=scale.normalise)  # fmt: skip
     _draw_sides(axes, mesh, displacement)
     colour_bar(axes, scale)
+    return drawn
+
+
+def draw_microstructure(rve: Mesh, displacement: FloatArray) -> Figure:
+    """Draw a deformed RVE over its undeformed boundary; ``displacement`` (k, 2) [mm]."""
+    boundary = MeshBoundary.of(rve)
+    every = np.concatenate([rve.nodes, rve.nodes + displacement])
+    low, high = every.min(axis=0), every.max(axis=0)
+    drawn, axes = bare_axes(WIDTH, high - low, 0.98, 0.03, 0.03)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    draw_path(axes, boundary.path(), fill=False, ec=MUTED, lw=0.5, ls=":", clip_on=False)
+    draw_path(axes, boundary.path(displacement), fc=BLUE, ec=EDGE, lw=0.5, alpha=0.6, clip_on=False)
     return drawn
 
 

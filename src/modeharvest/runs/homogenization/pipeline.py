@@ -35,7 +35,7 @@ from modeharvest.runs.homogenization.case import (
 )
 from modeharvest.runs.homogenization.results import (
     HomogenizationData,
-    read_fields,
+    HomogenizedFields,
     response_of,
     summary_of,
     write_fields,
@@ -278,10 +278,10 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
     def _data(self) -> HomogenizationData:
         """All that the report shows."""
         found, (mode, parameters) = self.homogenize(), self.mode()
-        mesh, states = read_fields(self.folder / "homogenized.h5")
+        fields = HomogenizedFields.read(self.folder / "homogenized.h5")
         result, measured = self.result, None
         if result is not None:
-            x, y = mesh.nodes.T
+            x, y = fields.mesh.nodes.T
             measured = result.ansatz.v(0, result.unknowns, x[:, None], y[:, None])[:, 0]
         return HomogenizationData(
             found=found,
@@ -289,8 +289,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             path=solution.info["path"],
             mode=mode,
             parameters=parameters,
-            mesh=mesh,
-            states=states,
+            fields=fields,
             measured=measured,
             measured_strain=self._measured_strain if measured is not None else None,
             command=f"modeharvest homogenize {self.source} --out {self.folder}",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,6 +44,8 @@ class StateFields:
     strains: FloatArray
     stresses: FloatArray
     """(p, 4 + 3 m) F̄, v, g and P̄, Pi, Lambda at the points of the lattice, row by row."""
+    microstructure: FloatArray
+    """(p, k, 2) displacement of the RVE's nodes at each point, from its middle [mm]."""
 
 
 def write_fields(found: Homogenized, body: HomogenizedBody, path: Path) -> None:
@@ -55,10 +57,16 @@ def write_fields(found: Homogenized, body: HomogenizedBody, path: Path) -> None:
     with atomic_hdf5(path) as file:
         file.attrs["format"] = FORMAT
         write_values(file.create_group("mesh"), _unfolded(body.mesh, signs))
+        write_values(file.create_group("rve"), body.rves[0].cell.cell.mesh)
+        file["points"] = body.places
         for k, state in enumerate(found.states):
             u = np.concatenate([state.displacement * sign for sign in signs])
             v = np.tile(state.amplitudes, (len(signs), 1))
-            fields = StateFields(state.load, u, v, state.strains, state.stresses)
+            micro = np.stack([
+                body.microstructure(state.value, state.strains, number)
+                for number in range(0, len(body.places) * len(body.rves), len(body.rves))
+            ])  # fmt: skip
+            fields = StateFields(state.load, u, v, state.strains, state.stresses, micro)
             write_values(file.create_group(f"states/{k:03d}"), fields)
 
 
@@ -73,12 +81,26 @@ def _unfolded(mesh: Mesh, signs: FloatArray) -> Mesh:
     return Mesh(nodes, np.concatenate(cells), mesh.element)
 
 
-def read_fields(path: Path) -> tuple[Mesh, tuple[StateFields, ...]]:
-    """What :func:`write_fields` wrote."""
-    with open_hdf5(path, "a homogenized specimen", form=FORMAT) as file:
-        states = file.get("states", {})
-        found = tuple(read_values(states[key], StateFields) for key in sorted(states))
-        return read_values(file["mesh"], Mesh), found
+@dataclass(frozen=True, eq=False)
+class HomogenizedFields:
+    """The content of ``homogenized.h5``."""
+
+    mesh: Mesh
+    """Macroscopic, of the whole specimen [mm]."""
+    rve: Mesh
+    """From its middle [mm]."""
+    points: FloatArray
+    """(p, 2) where the RVEs are [mm]; of a quarter its own."""
+    states: tuple[StateFields, ...]
+
+    @classmethod
+    def read(cls, path: Path) -> HomogenizedFields:
+        """What :func:`write_fields` wrote."""
+        with open_hdf5(path, "a homogenized specimen", form=FORMAT) as file:
+            states = file.get("states", {})
+            found = tuple(read_values(states[key], StateFields) for key in sorted(states))
+            mesh, rve = (read_values(file[name], Mesh) for name in ("mesh", "rve"))
+            return cls(mesh, rve, file["points"][()], found)
 
 
 def response_of(found: Homogenized) -> Response:
@@ -101,8 +123,7 @@ class HomogenizationData:
     mode: LatticeMode | None
     parameters: ModeParameters | None
     """None where they were not given, or not measured."""
-    mesh: Mesh
-    states: Sequence[StateFields]
+    fields: HomogenizedFields
     measured: FloatArray | None
     measured_strain: float | None
     """(n,) v of the measured mode at the mesh's nodes [mm], at which strain; None if there is none.
@@ -114,7 +135,7 @@ class HomogenizationData:
         """The homogenized state at the strain of the measured one."""
         if self.measured_strain is None:
             return None
-        near = [s for s in self.states if abs(s.load - self.measured_strain) < 1e-9]
+        near = [s for s in self.fields.states if abs(s.load - self.measured_strain) < 1e-9]
         return near[0] if near else None
 
 
@@ -141,7 +162,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
         "rves": found["rves"],
         "linearisations": found["linearisations"],
         "files": {
-            "homogenized.h5": "mesh and states: u, v_i, generalised strains and stresses (HDF5)",
+            "homogenized.h5": "mesh and states: u, v_i, generalised strains, stresses, RVEs (HDF5)",
             "homogenized.json": "critical strain, forces, energies, sensitivities",
             "mode.json": "the mode as it was measured and snapped, with its covariances",
             "experiment/": "the direct simulation, the images, and what was measured in them",
