@@ -20,7 +20,7 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.modes import square_family
+from modeharvest.idic.modes import free_family, square_family
 from modeharvest.idic.photograph.measure import measure_whole
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Outcome
@@ -203,6 +203,30 @@ def test_a_correlation_that_went_astray_is_done_again(photographs: Path, harvest
     assert found.result.outcome is Outcome.CONVERGED
     assert rms_px(found.result.displacement() - right.displacement(), SCENE.mask) < 0.01
     assert "started from the ansatz fitted to the whole displacement" in found.text[-2]
+
+
+def test_a_family_with_fewer_parameters_takes_the_place_of_free_waves(
+    photographs: Path, harvested: Path
+) -> None:
+    case = PhotographCase.read(experiment(photographs, "[whole_field]\nmeasure = true\n"))
+    run = HarvestRun(case, harvested)
+    first = run.results()["frame_2"]
+    square, on_mesh = first.result, FiniteElementOptions(edge_px=2)
+    mode = square.ansatz.modes[0]
+    waves = free_family(mode.family.waves(square.mode_parameters()))
+    ansatz = replace(square.ansatz, modes=(replace(mode, family=waves),))
+    guess = ansatz.initial_guess()
+    guess[: ansatz.phi_offset(0)] = square.unknowns[: ansatz.phi_offset(0)]
+    free = fit_displacement(square.displacement(), SCENE.grid, ansatz, guess, SCENE.mask)
+    assert free.outcome is Outcome.CONVERGED
+    found = measure_whole(
+        run.prepared.pair("frame_2"), run.geometry, PITCH, case.correlation,
+        replace(first, result=free),
+        on_mesh.body(run.geometry.mask, SCENE.grid), on_mesh, run.prepared.noise,
+    )  # fmt: skip
+    assert [mode.family.size for mode in found.result.ansatz.modes] == [7]
+    assert found.result.outcome is Outcome.CONVERGED
+    assert rms_px(found.result.displacement() - square.displacement(), SCENE.mask) < 0.01
 
 
 def test_where_every_correlation_is_trapped_the_refitted_ansatz_is_the_result(

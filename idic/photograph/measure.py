@@ -178,11 +178,9 @@ def measure_whole(
     """Measure the whole displacement of a photograph that was correlated, and the modes in it.
 
     The measurement starts from the correlation, or from blocks of the speckle where that ended
-    astray. If its spectra show other waves than the correlation has, or that isn't converged, the
-    ansatz fitted to it starts another; if that ends astray, too, the fit itself is the result.
-
-    ``body``, ``on_mesh``: the mesh of the material, and how to measure on it. The rest, and
-    InputErrors, as for :func:`measure` and ``displacement_from``.
+    astray. If its spectra show other waves than the correlation has, or a family with fewer
+    parameters for them, or that isn't converged, the ansatz fitted to it starts another; if that
+    ends astray, too, the fit itself is the result. For the rest see :func:`measure`.
     """
     mesh, found, mask = body.mesh, first.result, geometry.mask
     if found.outcome not in ASTRAY:
@@ -205,7 +203,8 @@ def measure_whole(
         domain=geometry.region.domain, options=how,
     )  # fmt: skip
     ansatz, unknowns = chosen_modes(guess, geometry, cell_size, how)
-    if _goes_on(found, ansatz, unknowns):
+    now, before = (sum(mode.family.size for mode in one.modes) for one in (ansatz, found.ansatz))
+    if now >= before and _goes_on(found, ansatz, unknowns):
         refit = refitted(measured, found.ansatz, found.unknowns, mask)
         text = (*first.text, "The spectra of the whole displacement show no other waves.")
     else:
