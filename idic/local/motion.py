@@ -1,10 +1,11 @@
 """Motion before any correlation: from hole centres, outlines or optical flow, by robust fits.
 
 Optical flow: the deformed image is warped back by what is known already (a slow field through
-hole centres, say), and the rest is found on binned and blurred images by iterated Lucas–Kanade
-windows as in scikit-image (Le Besnerais & Champagnat, 2005, doi 10.1109/ICIP.2005.1529706). On the
-paper's specimen after buckling half of its points are within 0.6 px of the truth, a tenth are more
-than 2 px off, mostly at holes' edges; a subset DIC does better, but needs to be installed.
+hole centres, say), and the remaining optical flow is found on binned and blurred images by
+iterated Lucas–Kanade windows (scikit-image; Le Besnerais & Champagnat, 2005, doi
+10.1109/ICIP.2005.1529706). On the paper's specimen after buckling half of its points are within
+0.6 px of the truth, a tenth are more than 2 px off, mostly at holes' edges; a subset DIC does
+better, but needs to be installed.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_fill_holes, gaussian_filter, map_coordinates, zoom
-from skimage.transform import pyramid_reduce
+from scipy.ndimage import binary_fill_holes
+from skimage.registration import optical_flow_ilk
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box, orders
@@ -80,9 +81,7 @@ def fit_unknowns(
     a = ansatz.checked(a).copy()
     stride = max(1, -(-int(field.good.sum()) // MOST_POINTS))
     points, u = field.points[field.good][::stride], field.u[field.good][::stride]
-    v0, v = (np.arange(len(orders(degree))) for degree in (v0_degree, v_degree))
-    places = [ansatz.v0_slice(c).start + v0 for c in (0, 1)]
-    free = np.concatenate(places + [ansatz.v_slice(m).start + v for m in range(len(ansatz.modes))])
+    free = _low_orders(ansatz, v0_degree, v_degree)
     if 2 * len(points) < free.size:
         raise InputError(
             f"initial guess: expected at least {-(-free.size // 2)} points, got {len(points)}"
@@ -93,6 +92,13 @@ def fit_unknowns(
     fit = robust_fit(columns.reshape(-1, free.size), rest.ravel())
     a[free] = fit.coefficients
     return RobustFit(a, fit.sd, fit.outliers)
+
+
+def _low_orders(ansatz: Ansatz, v0_degree: int, v_degree: int) -> NDArray[np.intp]:
+    """Where v0 and v_i up to these degrees are among the unknowns."""
+    v0, v = (np.arange(len(orders(degree))) for degree in (v0_degree, v_degree))
+    places = [ansatz.v0_slice(c).start + v0 for c in (0, 1)]
+    return np.concatenate(places + [ansatz.v_slice(m).start + v for m in range(len(ansatz.modes))])
 
 
 SLOW_DEGREE = 3
@@ -114,8 +120,10 @@ def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tupl
     if pair.mask is not None and pair.deformed_mask is not None:
         plane = outline_motion(pair.mask, pair.deformed_mask, pair.grid)
     if plane is None:
-        message = "v0 starts from no motion: neither holes nor whole outlines are known."
-        return np.zeros_like, message
+        return (
+            np.zeros_like,
+            "v0 starts from no motion: neither holes nor whole outlines are known.",
+        )
     return partial(_affine, plane), (
         f"v0 starts from the outlines: {100 * plane[0, 1]:+.1f} % along x and "
         f"{100 * plane[1, 2]:+.1f} % along y."
@@ -168,12 +176,15 @@ CELL_PX = 48
 """Binned pixels a unit cell: enough to see its pattern, few enough to be quick."""
 BLUR = 2.0
 """Of the binned images [binned px]."""
-WINDOW, WARPS, SMALL = 3.75, 8, 32
-"""Standard deviation of a window [binned px]; iterations a level; where the pyramid ends [px]."""
+RADIUS = 7
+"""Of a window [binned px]."""
+WARPS = 8
+"""Iterations on each level of the flow's own pyramid."""
 STEP = 2
 """Distance of the field's points [binned px]."""
 DITHER = 1e-3
-"""Noise added to both images, of their contrast: what windows without any texture give spreads."""
+"""Noise added to both images, of their contrast: a window without any texture has no flow at all,
+and what it gives instead would spread."""
 
 
 def coarse_field(pair: ImagePair, cell_size: float, known: Slow) -> LocalField:
@@ -213,27 +224,11 @@ def _warped_back(level: LevelPair, slow: FloatArray) -> tuple[NDArray[Any], Bool
 
 
 def _flow(reference: NDArray[Any], deformed: NDArray[Any]) -> FloatArray:
-    """(rows, cols, 2) displacement along columns and rows [px], from coarse images to fine ones."""
-    rng, noise = np.random.default_rng(0), DITHER * float(reference.std())
-    levels = [[i + noise * rng.standard_normal(i.shape) for i in (reference, deformed)]]
-    while min(levels[-1][0].shape) > SMALL:
-        levels.append([pyramid_reduce(i, 2) for i in levels[-1]])  # type: ignore[no-untyped-call]
-    flow: FloatArray = np.zeros((2, 1, 1))
-    for f, g in reversed(levels):
-        scale = np.divide(f.shape, flow.shape[1:])
-        flow = scale[:, None, None] * zoom(flow, (1, *scale), order=0, mode="nearest")
-        for _ in range(WARPS):
-            flow = _corrected(flow, f, g)
-    return np.moveaxis(flow[::-1], 0, -1)
-
-
-def _corrected(flow: FloatArray, f: FloatArray, g: FloatArray) -> FloatArray:
-    """(2, rows, cols) the flow after a step by Lucas–Kanade windows; none without texture."""
-    warped = map_coordinates(g, np.indices(f.shape) + flow, order=1, mode="nearest")
-    down, right = np.gradient(warped)
-    rest = f - warped + down * flow[0] + right * flow[1]
-    products = down * down, down * right, right * right, down * rest, right * rest
-    a, b, c, p, q = (gaussian_filter(i, WINDOW, mode="mirror") for i in products)
-    determinant = a * c - b * b
-    determinant[np.abs(determinant) < 1e-14] = np.inf
-    return np.asarray(np.stack([c * p - b * q, a * q - b * p]) / determinant)
+    """(rows, cols, 2) displacement along columns and rows [px]."""
+    rng = np.random.default_rng(0)
+    noise = DITHER * float(reference.std())
+    f, g = (np.float64(i) + noise * rng.standard_normal(i.shape) for i in (reference, deformed))
+    down, right = optical_flow_ilk(  # type: ignore[no-untyped-call]
+        f, g, radius=RADIUS, num_warp=WARPS, gaussian=True, prefilter=False, dtype=np.float64
+    )
+    return np.stack([right, down], axis=-1)
