@@ -18,14 +18,8 @@ import numpy as np
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.distortion.lens import Positions
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.bernstein import bezier_matrix, require_positive_jacobian
 from modeharvest.imaging.mapping.element_table import ElementTable, Pixels, bands, tabulate_elements
-from modeharvest.imaging.mapping.elements import (
-    bezier_matrix,
-    monomial_gradients,
-    polynomials,
-    reference_element,
-    require_positive_jacobian,
-)
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
 from modeharvest.imaging.mapping.rasterise import fill
 from modeharvest.imaging.pair import Truth
@@ -33,6 +27,7 @@ from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.imaging.speckle.periodic_spline import BLOCK, SplineTable, sample, workspace
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
 from modeharvest.util.compiled import compiled, in_parallel
+from modeharvest.util.elements import monomial_gradients, polynomials, reference_element
 
 _BAND = 16  # rows that a thread averages at a time
 

@@ -22,7 +22,7 @@ from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize, ranked_branches
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
-from modeharvest.fem.lattice.micromorphic.elements import rectangle_mesh
+from modeharvest.fem.lattice.micromorphic.mesh import rectangle_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.path import HomogenizedPath
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern, snapped

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,14 @@ def test_a_wave_of_another_lattice_is_refused() -> None:
         LatticeMode.of(mode, off, specimen, cell_vectors(specimen))
 
 
+def test_a_pattern_between_the_holes_of_its_lattice_is_refused() -> None:
+    specimen = Specimen(6, 10)
+    (mode,) = Ansatz.of_specimen(specimen).modes
+    moved = mode.family.start + np.array([0, 0, 0, 0, 0, 0.4, 0.4])
+    with pytest.raises(InputError, match=r"expected phases of the lattice"):
+        LatticeMode.of(mode, moved, specimen, cell_vectors(specimen))
+
+
 class Linear:
     """A response that is linear in the first amplitude of a mode."""
 
@@ -142,6 +151,15 @@ def test_error_bars_are_propagated_by_differences() -> None:
     assert effects[0].sd_noise == pytest.approx(1e-4)
 
 
+def test_without_images_error_bars_are_those_of_noise() -> None:
+    linear = Linear()
+    response = linear.response(linear.snapped(linear.start))
+    errors = replace(parameters(linear, 0.02), by_model_error=None)
+    found, effects = with_errors(response, errors, linear.snapped, linear.response)
+    assert found.critical_strain_sd == pytest.approx(0.01 * 1e-4)
+    assert effects[0].sd_model_error is None
+
+
 def test_a_state_that_a_changed_mode_does_not_reach_has_no_error_bar() -> None:
     linear = Linear(reached=1)
     response = linear.response(linear.snapped(linear.start))
@@ -164,6 +182,7 @@ def test_a_pattern_and_its_mirror_image_are_one() -> None:
     ("change", "message"),
     [
         ({"experiment.specimen": {"stacking": "triangular"}}, "square stacking, got triangular"),
+        ({"homogenization": {"quarter": False}, "experiment": {"guided": True}}, "straight"),
         ({"experiment.specimen": {"grading_x": 0.001}}, "without grading, scatter and tilt"),
         ({"mode": {"strain": 0.2}}, "expected a strain among"),
         ({"mode": {"kind": "guessed"}}, "expected a mode kind among"),
@@ -212,7 +231,29 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     assert again == summary
     assert (out / "homogenized.json").stat().st_mtime_ns == before
     print_report(homogenization_report(again), out)
-    assert "States, homogenized and direct" in capsys.readouterr().out
+    amplitude = summary["amplitude"]
+    assert amplitude["homogenized_rms_mm"] == pytest.approx(amplitude["measured_rms_mm"], rel=0.3)
+    assert summary["mode"]["errors"] == "model error"
+    assert "phi1 is not observable" in summary["warnings"][0], "four holes are few"
+    assert {s["negative_eigenvalues"] for s in summary["states"]} == {0}
+    # The same mode from its file: without the images it was measured in, and their strain.
+    result = out / "experiment/correlation/result_1300.json"
+    one = SMALL.replace('"measured"', f'"file"\npath = "{result}"')
+    one = one.replace("mesh_size = 0.5\n[mode]", "mesh_size = 0.5\nfirst_order = false\n[mode]")
+    from_file = HomogenizationRun(case_of(tmp_path / "file.toml", one), tmp_path / "file").all()
+    assert from_file["critical_strain"] == pytest.approx(summary["critical_strain"], rel=1e-9)
+    assert from_file["mode"]["errors"] == "noise"
+    assert from_file["critical_strain_sd"] < 0.5 * summary["critical_strain_sd"]
+    assert from_file["amplitude"] is None
+    before_buckling = SMALL.replace('"measured"', '"measured"\nstrain = 0.03')
+    early = HomogenizationRun(case_of(tmp_path / "early.toml", before_buckling), out)
+    with pytest.raises(InputError, match=r"expected an image of the buckled .* not observable"):
+        early.all()
+
+
+def case_of(path: Path, text: str) -> HomogenizationCase:
+    path.write_text(text, "utf-8")
+    return HomogenizationCase.read(path)
 
 
 def main_exit(code: int) -> None:

@@ -11,14 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import (
-    non_positive_jacobians,
-    reference_element,
-    require_positive_jacobian,
-    shape_functions,
-    shape_gradients,
-)
+from modeharvest.imaging.mapping.bernstein import non_positive_jacobians, require_positive_jacobian
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
+from modeharvest.util.elements import reference_element, shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import reference_element
 from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.util.elements import reference_element
 
 FloatArray = NDArray[np.float64]
 H = 0.125  # mm/px, a binary fraction: edges and nodes lie exactly on pixel centres

@@ -20,9 +20,12 @@ from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, snapped
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.modes import FourierMode
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 
 _LEAST_STEP = 1e-3
 """Of a parameter [-], [mm]: smaller differences would be rounding."""
+_LEAST_OVERLAP = 0.9
+"""Of a mode with itself, its phases snapped [-]."""
 _SAME = 1e-9
 """Of the largest amplitude: patterns closer than that are one."""
 
@@ -38,6 +41,8 @@ class StateNumbers:
     energy_N: float
     """Stored, by thickness."""
     branch: str = "primary"
+    negative_eigenvalues: int | None = None
+    """Of the tangent, of both scales where there are two; 0: stable, None: unknown."""
     force_sd_N_per_mm: float | None = None
     energy_sd_N: float | None = None
     """Standard deviations by the mode's; None where it has none."""
@@ -74,8 +79,8 @@ def direct_response(solution: Solution) -> Response:
     """That of a direct simulation; of two states at a strain the buckled one counts."""
     states = {}
     for s in sorted(solution.snapshots, key=lambda s: s.branch != "primary"):
-        numbers = StateNumbers(s.nominal_strain, s.reaction, s.energy, s.branch)
-        states[s.nominal_strain] = numbers
+        numbers = s.nominal_strain, s.reaction, s.energy, s.branch, s.negative_pivots
+        states[s.nominal_strain] = StateNumbers(*numbers)
     critical: Mapping[str, Any] = solution.info.get("critical") or {}
     ordered = tuple(states[strain] for strain in sorted(states))
     return Response(critical.get("strain"), ordered, str(solution.info.get("outcome", "complete")))
@@ -97,19 +102,31 @@ class LatticeMode:
         """Of a Fourier mode of a specimen; ``vectors`` (2, 2) of the RVE as rows [mm].
 
         Phases are kept at the specimen's middle, where the origin is. InputError where a wave
-        vector is farther than a tenth from one that repeats on the RVE.
+        vector is farther than a tenth from one that repeats on the RVE, or where snapping the
+        phases leaves another pattern.
         """
-        waves = mode.family.waves(parameters)
-        found = PlaneWaves.of_sines(waves, mode.half_wavelength, mode.scale)
-        hole = _central_hole(specimen)
-        moved = found.moved(-hole)
-        return cls(moved, snapped(moved, vectors, about=-hole, inversion_centre=(0.0, 0.0)))
+        waves, hole = mode.family.waves(parameters), _central_hole(specimen)
+        found = PlaneWaves.of_sines(waves, mode.half_wavelength, mode.scale).moved(-hole)
+        mode_found = cls(found, snapped(found, vectors, -hole, inversion_centre=(0.0, 0.0)))
+        if not (overlap := mode_found.overlap(snapped(found, vectors, -hole))) >= _LEAST_OVERLAP:
+            raise InputError(
+                "mode: expected phases of the lattice, its holes at points of symmetry, got a "
+                f"pattern of which snapping them leaves {100 * overlap:.0f} % (overlap); take one "
+                "that is observable, measured with the specimen's middle at the origin"
+            )
+        return mode_found
 
     @property
     def wave_change(self) -> FloatArray:
         """(w,) changes of the wave vectors by snapping, over their lengths [-]."""
         k, to = self.measured.vectors, self.snapped.vectors
         return np.asarray(np.linalg.norm(to - k, axis=1) / np.linalg.norm(k, axis=1))
+
+    def overlap(self, waves: PlaneWaves) -> float:
+        """Cosine between the snapped pattern and one of the same wave vectors [-]."""
+        pairs = [(getattr(self.snapped, n), getattr(waves, n)) for n in ("cosine", "sine")]
+        a, b = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
+        return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
 
     def is_same(self, other: LatticeMode) -> bool:
         """Whether snapping has made one pattern of both."""
@@ -134,16 +151,21 @@ class ModeParameters:
     values: FloatArray
     """(m,)."""
     by_noise: FloatArray
-    by_model_error: FloatArray
-    """(m, m) covariances by noise, and by the residual cell by cell, noise included; NaN where
-    they are not known."""
+    by_model_error: FloatArray | None = None
+    """(m, m) covariances by noise, and by the residual cell by cell, noise included; None where
+    that is not known: a result without its images, a specimen of few cells."""
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> ModeParameters:
         """From plain values."""
-        names, units = tuple(content["names"]), tuple(content["units"])
-        keys = ("values", "by_noise", "by_model_error")
-        return cls(names, units, *(np.array(content[key], dtype=np.float64) for key in keys))
+        arrays = (content[key] for key in ("values", "by_noise", "by_model_error"))
+        known = (None if a is None else np.array(a, dtype=np.float64) for a in arrays)
+        return cls(tuple(content["names"]), tuple(content["units"]), *known)  # type: ignore[arg-type]
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The larger one that is known."""
+        return self.by_noise if self.by_model_error is None else self.by_model_error
 
 
 @dataclass(frozen=True)
@@ -171,7 +193,7 @@ def with_errors(
     mode: Callable[[FloatArray], LatticeMode],
     predicted: Callable[[LatticeMode], Response],
 ) -> tuple[Response, tuple[ParameterEffect, ...]]:
-    """Propagate the standard deviations of a mode's parameters to the response.
+    """Propagate the covariance of a mode's parameters to the response.
 
     response : with the parameters themselves.
     mode : from parameters (m,), snapped.
@@ -179,17 +201,17 @@ def with_errors(
     """
     m, here = len(parameters.values), mode(parameters.values)
     J, is_snapped = np.zeros((len(response.values), m)), np.zeros(m, bool)
-    sds = [np.sqrt(np.diag(C)) for C in (parameters.by_noise, parameters.by_model_error)]
+    sds = [np.full(m, np.nan) if C is None else np.sqrt(np.diag(C))
+           for C in (parameters.by_noise, parameters.by_model_error)]  # fmt: skip
     for k in range(m):
-        size = [sd[k] for sd in sds if np.isfinite(sd[k])]
         step = np.zeros(m)
-        step[k] = max(_LEAST_STEP, *size)
+        step[k] = max(_LEAST_STEP, np.sqrt(parameters.covariance[k, k]))
         there = mode(parameters.values + step)
         is_snapped[k] = here.is_same(there)
         if not is_snapped[k]:
             J[:, k] = (predicted(there).values_at(response) - response.values) / step[k]
-    covariance, count = np.nan_to_num(parameters.by_model_error), len(response.states)
-    every = [_known(sd) for sd in np.sqrt(np.einsum("ik,kl,il->i", J, covariance, J))]
+    variances, count = np.einsum("ik,kl,il->i", J, parameters.covariance, J), len(response.states)
+    every = [_known(sd) for sd in np.sqrt(variances)]
     states = tuple(
         replace(s, force_sd_N_per_mm=force, energy_sd_N=energy)
         for s, force, energy in zip(

@@ -14,8 +14,8 @@ import numpy as np
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
-from modeharvest.imaging.mapping.elements import reference_element, shape_gradients
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.elements import reference_element, shape_gradients
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import nearest
 

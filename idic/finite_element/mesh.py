@@ -19,7 +19,7 @@ from skimage import measure
 
 from modeharvest.fem.field import Mesh, with_mid_sides
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import require_positive_jacobian
+from modeharvest.imaging.mapping.bernstein import require_positive_jacobian
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 

@@ -20,9 +20,9 @@ from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
 from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.elements import shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
 
 _BEYOND_PX = 2.0

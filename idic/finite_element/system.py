@@ -34,9 +34,9 @@ from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.idic.finite_element.pixels import MeshPixels, NodalEquations
-from modeharvest.imaging.mapping.elements import reference_element, shape_gradients
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
+from modeharvest.util.elements import reference_element, shape_gradients
 
 _PENALTY = 100.0
 """Of jumps of gradients across sides, against those of second gradients [-]."""

@@ -26,8 +26,8 @@ from scipy.special import roots_jacobi
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.options import lattice_vectors
-from modeharvest.imaging.mapping.elements import reference_element, shape_functions, shape_gradients
 from modeharvest.util.arrays import ComplexArray, FloatArray
+from modeharvest.util.elements import reference_element, shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
 
 

@@ -8,17 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import (
-    ReferenceElement,
+from modeharvest.imaging.mapping.bernstein import (
     bezier_matrix,
     lattice_points,
-    monomial_gradients,
-    reference_element,
     sub_elements,
     to_bernstein,
 )
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.compiled import compiled, in_parallel
+from modeharvest.util.elements import ReferenceElement, monomial_gradients, reference_element
 
 BEYOND = (0.25, 0.1, 0.03)
 """How far beyond an element's edges, in (xi, eta), its map is tried to be proved one to one."""

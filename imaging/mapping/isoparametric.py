@@ -21,17 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping import rasterise
+from modeharvest.imaging.mapping.bernstein import require_positive_jacobian
 from modeharvest.imaging.mapping.element_table import (
     ElementTable,
     Pixels,
     bands,
     fill_buckets,
     tabulate_elements,
-)
-from modeharvest.imaging.mapping.elements import (
-    polynomials,
-    reference_element,
-    require_positive_jacobian,
 )
 from modeharvest.imaging.mapping.inversion import (
     ON_EDGE,
@@ -43,6 +39,7 @@ from modeharvest.imaging.mapping.inversion import (
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled, in_parallel
+from modeharvest.util.elements import polynomials, reference_element
 from modeharvest.util.errors import InputError
 
 

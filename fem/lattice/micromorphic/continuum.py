@@ -19,7 +19,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.lattice.micromorphic.elements import Quadrature, quadrature, specimen_mesh
+from modeharvest.fem.lattice.micromorphic.mesh import Quadrature, quadrature, specimen_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.rve import RVE
 from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent

@@ -46,6 +46,11 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
             Section.of("homogenized-amplitude", _amplitude_cards(data)),
             Section.of("homogenized-mode", _mode_cards(summary)),
         ],
+        warnings=[
+            *summary["warnings"],
+            *(text_of("homogenized-unstable", strain=100 * state["nominal_strain"], **state)
+            for state in summary["states"] if state["negative_eigenvalues"])
+        ],
         notes=[text_of("homogenized-choices", **summary["case"]["homogenization"])],
         command=data.command if data else "",
         case=summary["case"],
@@ -70,7 +75,8 @@ def _pairs(summary: Summary) -> list[tuple[Mapping[str, Any], Mapping[str, Any] 
 
 def _state_row(pair: tuple[Mapping[str, Any], Mapping[str, Any] | None]) -> Mapping[str, Any]:
     state, direct = pair
-    row = {"strain": f"{100 * state['nominal_strain']:.4g}", "branch": state["branch"]}
+    row = {"strain": f"{100 * state['nominal_strain']:.4g}", "branch": state["branch"],
+           "negative": state["negative_eigenvalues"]}  # fmt: skip
     for name, key, sd in (
         ("force", "force_N_per_mm", "force_sd_N_per_mm"), ("energy", "energy_N", "energy_sd_N"),
     ):  # fmt: skip
@@ -100,8 +106,9 @@ def findings(summary: Summary) -> list[str]:
         text.append(text_of("homogenized-first-order", value=100 * first,
                             off="" if off is None else f", {off:+.1f} %"))  # fmt: skip
     mode = summary["mode"]
-    if mode is not None and summary["sensitivities"]:
-        text.append(text_of("homogenized-snapped", change=100 * max(mode["wave_change"])))
+    if mode is not None and mode["errors"] is not None:
+        change = 100 * max(mode["wave_change"])
+        text.append(text_of("homogenized-snapped", change=change, errors=mode["errors"]))
     amplitude = summary["amplitude"]
     if amplitude is not None:
         share = 100 * amplitude["difference_rms_mm"] / amplitude["measured_rms_mm"]
@@ -154,8 +161,8 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
         return []
     state, mesh = data.compared or data.fields.states[-1], data.fields.mesh
     v, fields = state.amplitudes[:, 0], {"homogenized": state.amplitudes[:, 0]}
-    if data.compared is not None and data.measured is not None:
-        v, measured = aligned(v, data.measured)
+    if data.compared is not None:
+        v, measured = aligned(v, data.measured_at(mesh.nodes))
         fields = {"homogenized": v, "measured in the images": np.where(np.isnan(v), v, measured)}
     every = np.concatenate([values[np.isfinite(values)] for values in fields.values()])
     scale = ColourScale.signed(every, "mm")
@@ -187,9 +194,9 @@ def _mode_cards(summary: Summary) -> list[Card]:
 
 
 def _effect_row(effect: Mapping[str, Any]) -> Mapping[str, Any]:
-    sd = effect["sd_model_error"]
+    sd = effect["sd_noise"] if effect["sd_model_error"] is None else effect["sd_model_error"]
     row = {"name": f"{effect['name']} [{effect['unit']}]", "value": f"{effect['value']:.5f}",
-           "noise": effect["sd_noise"], "model": sd}  # fmt: skip
+           "noise": effect["sd_noise"], "model": effect["sd_model_error"]}  # fmt: skip
     if effect["snapped"]:
         return row | {"critical": "0 (snapped)", "force": "0 (snapped)", "energy": "0 (snapped)"}
     slopes = {

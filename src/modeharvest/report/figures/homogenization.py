@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.mapping.elements import shape_functions
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above, ring
 from modeharvest.report.figures.maps import WIDTH, ColourScale, bare_axes, colour_bar
 from modeharvest.report.figures.style import BLUE, EDGE, GREEN, MUTED, RED, draw_path
 from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.elements import shape_functions
 
 _FINE = 8
 """Parts of an element's side that are drawn."""

@@ -136,7 +136,12 @@ class HomogenizationCase(CaseModel):
                 "homogenization: expected a specimen without grading, scatter and tilt: one RVE "
                 "stands for all of it"
             )
-        if self.mode == MeasuredMode() and self.correlation.fixed_mode:
+        if experiment.guided and not self.homogenization.quarter:
+            raise InputError(
+                "homogenization: expected quarter = true for a guided specimen, whose middle line "
+                "stays straight, got false"
+            )
+        if isinstance(self.mode, MeasuredMode) and self.correlation.fixed_mode:
             raise InputError("mode: expected a free mode to be measured, got fixed_mode = true")
         strain = getattr(self.mode, "strain", None)
         if strain is not None and strain not in experiment.strains:

@@ -19,13 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from modeharvest.fem.field import Solution
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.patterns import ModeField, PlaneWaves, rotation_pattern
 from modeharvest.fem.lattice.options import uniaxial
 from modeharvest.idic.result import Result
-from modeharvest.idic.uncertainty.covariance import MatchedImages
+from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.idic.uncertainty.covariance import Covariance, covariance
+from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.experiment import Run
 from modeharvest.runs.homogenization.case import (
     AnalyticMode,
@@ -79,20 +81,16 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         """The virtual experiment."""
         return Run(self.case.virtual, self.folder / "experiment", self.progress)
 
-    def direct(self) -> Solution:
-        """The direct simulation of the specimen."""
-        return self.virtual.fem()
-
-    def mode(self) -> tuple[LatticeMode | None, ModeParameters | None]:
-        """The mode, and the parameters that it was measured with; leaves ``mode.json``.
+    def mode(self) -> tuple[LatticeMode | None, ModeParameters | None, tuple[str, ...]]:
+        """The mode, the parameters it was measured with, and warnings; leaves ``mode.json``.
 
         None for a mode that is computed, and for parameters of one that is not measured.
         """
         path = self.folder / "mode.json"
 
         def work() -> tuple[Path, ...]:
-            mode, parameters = self._found_mode()
-            write_json(path, to_plain({"mode": mode, "parameters": parameters}))
+            names = "mode", "parameters", "warnings"
+            write_json(path, to_plain(dict(zip(names, self._found_mode(), strict=True))))
             return (path,)
 
         self.do("mode", self._mode_key, work)
@@ -100,12 +98,13 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             content = read_json(path)
             mode, parameters = content["mode"], content["parameters"]
             found = mode and LatticeMode(*(PlaneWaves(**mode[k]) for k in ("measured", "snapped")))
-            return found, parameters and ModeParameters.of(parameters)
+            known = parameters and ModeParameters.of(parameters)
+            return found, known, tuple(content["warnings"])
 
     def homogenize(self) -> dict[str, Any]:
         """Follow the homogenized specimen; leaves ``homogenized.json`` and ``.h5``."""
         path, fields = self.folder / "homogenized.json", self.folder / "homogenized.h5"
-        mode, parameters = self.mode()
+        mode, parameters, _ = self.mode()
         how = self.case.homogenization
 
         def work() -> tuple[Path, ...]:
@@ -208,30 +207,43 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         first = self.result.ansatz.modes[0]
         return LatticeMode.of(first, parameters, self.case.experiment.specimen, self._cell.lattice)
 
-    def _found_mode(self) -> tuple[LatticeMode | None, ModeParameters | None]:
+    def _found_mode(self) -> tuple[LatticeMode | None, ModeParameters | None, tuple[str, ...]]:
         result, specimen = self.result, self.case.experiment.specimen
         if isinstance(self.case.mode, AnalyticMode):
             ideal = rotation_pattern(specimen.pitch)
-            return LatticeMode(ideal, ideal), None
+            return LatticeMode(ideal, ideal), None, ()
         if result is None:
-            return None, None
+            return None, None, ()
         if not result.ansatz.modes or not result.ansatz.modes[0].family.size:
             raise InputError("mode: expected a result with a free mode, got one without")
-        return self._mode_of(result.mode_parameters()), self._parameters(result)
+        pair = self._pair
+        seen = identifiability(result, None if pair is None else pair.mask)
+        try:
+            mode = self._mode_of(result.mode_parameters())
+        except InputError as error:
+            if 0 not in seen.unobservable:
+                raise
+            raise InputError(f"mode: expected an image of the buckled specimen, got one in which "
+                             f"{seen.warnings[0]}") from error  # fmt: skip
+        return mode, self._parameters(result, pair), seen.warnings
 
-    def _parameters(self, result: Result) -> ModeParameters:
+    @property
+    def _pair(self) -> ImagePair | None:
+        """The images that the mode was measured in, if they are there."""
+        if not isinstance(self.case.mode, MeasuredMode):
+            return None
+        images = ImageSet.read(self.virtual.folder / "images")
+        return images.pair(self._measured_strain, camera=self.case.correlation.camera)
+
+    def _parameters(self, result: Result, pair: ImagePair | None) -> ModeParameters:
         """With the covariances that the result, and its images where they are there, have."""
         family, part = result.ansatz.modes[0].family, result.ansatz.phi_slice(0)
-        by_noise, mode = result.covariance()[part, part], self.case.mode
-        by_model_error = by_noise
-        if isinstance(mode, MeasuredMode):
-            images, how = ImageSet.read(self.virtual.folder / "images"), self.case.correlation
-            pair = images.pair(self._measured_strain, camera=how.camera)
-            matched = MatchedImages.of(result, pair, how.edge_px)
-            pitch = self.case.experiment.specimen.pitch
-            by_model_error = matched.sandwich_covariance(pitch)[part, part]
-        values = result.mode_parameters()
-        return ModeParameters(family.names, family.units, values, by_noise, by_model_error)
+        values, known = result.mode_parameters(), Covariance(result.covariance(), None)
+        if pair is not None:
+            noise, pitch = ImageNoise.of(result.noise_sd), self.case.experiment.specimen.pitch
+            known = covariance(result, pair, noise, pitch, self.case.correlation.edge_px)
+        both = (C if C is None else C[part, part] for C in (known.by_noise, known.by_model_error))
+        return ModeParameters(family.names, family.units, values, *both)  # type: ignore[arg-type]
 
     def _modes(self, mode: LatticeMode | None) -> list[ModeField]:
         """phi in the RVE's coordinates; one that is not given is computed."""
@@ -277,20 +289,17 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     def _data(self) -> HomogenizationData:
         """All that the report shows."""
-        found, (mode, parameters) = self.homogenize(), self.mode()
+        found, (mode, parameters, warnings) = self.homogenize(), self.mode()
         fields = HomogenizedFields.read(self.folder / "homogenized.h5")
-        result, measured = self.result, None
-        if result is not None:
-            x, y = fields.mesh.nodes.T
-            measured = result.ansatz.v(0, result.unknowns, x[:, None], y[:, None])[:, 0]
         return HomogenizationData(
             found=found,
             direct=direct_response(solution := self.virtual.fem()),
             path=solution.info["path"],
             mode=mode,
             parameters=parameters,
+            warnings=warnings,
             fields=fields,
-            measured=measured,
-            measured_strain=self._measured_strain if measured is not None else None,
+            measured=self.result if isinstance(self.case.mode, MeasuredMode) else None,
+            measured_strain=self._measured_strain,
             command=f"modeharvest homogenize {self.source} --out {self.folder}",
         )

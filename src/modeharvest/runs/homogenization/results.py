@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from modeharvest.fem.field import Mesh, read_values, write_values
+from modeharvest.idic.result import Result
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import atomic_hdf5, open_hdf5
 from modeharvest.util.stages import versions
@@ -26,8 +27,10 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
 
 FORMAT = "modeharvest-homogenized-1"
-SIGNS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
-"""Of x and y in the quarters."""
+_QUARTERS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
+"""Signs of x and y."""
+_V = 4
+"""Where v1 is among the generalised strains."""
 _REVERSED = [0, 3, 2, 1, 7, 6, 5, 4]
 """The nodes of a Q8 element the other way round."""
 
@@ -53,9 +56,9 @@ def write_fields(found: Homogenized, body: HomogenizedBody, path: Path) -> None:
 
     Of a quarter its mirror images are written too; its points stay those of the quarter.
     """
-    signs = SIGNS if body.copies == len(SIGNS) else np.ones((1, 2))
+    signs = _QUARTERS[: body.copies]
     with atomic_hdf5(path) as file:
-        file.attrs["format"] = FORMAT
+        file.attrs.update(format=FORMAT, copies=body.copies)
         write_values(file.create_group("mesh"), _unfolded(body.mesh, signs))
         write_values(file.create_group("rve"), body.rves[0].cell.cell.mesh)
         file["points"] = body.places
@@ -91,6 +94,8 @@ class HomogenizedFields:
     """From its middle [mm]."""
     points: FloatArray
     """(p, 2) where the RVEs are [mm]; of a quarter its own."""
+    copies: int
+    """4 where a quarter was followed, 1 otherwise."""
     states: tuple[StateFields, ...]
 
     @classmethod
@@ -100,12 +105,15 @@ class HomogenizedFields:
             states = file.get("states", {})
             found = tuple(read_values(states[key], StateFields) for key in sorted(states))
             mesh, rve = (read_values(file[name], Mesh) for name in ("mesh", "rve"))
-            return cls(mesh, rve, file["points"][()], found)
+            return cls(mesh, rve, file["points"][()], int(file.attrs["copies"]), found)
 
 
 def response_of(found: Homogenized) -> Response:
     """The numbers of a followed specimen."""
-    states = tuple(StateNumbers(s.load, s.force, s.energy, s.branch) for s in found.states)
+    states = tuple(
+        StateNumbers(s.load, s.force, s.energy, s.branch, s.negative_eigenvalues)
+        for s in found.states
+    )
     critical = found.critical
     return Response(None if critical is None else critical.load, states, found.outcome)
 
@@ -123,20 +131,25 @@ class HomogenizationData:
     mode: LatticeMode | None
     parameters: ModeParameters | None
     """None where they were not given, or not measured."""
+    warnings: tuple[str, ...]
+    """Of the mode's measurement."""
     fields: HomogenizedFields
-    measured: FloatArray | None
-    measured_strain: float | None
-    """(n,) v of the measured mode at the mesh's nodes [mm], at which strain; None if there is none.
-    """
+    measured: Result | None
+    measured_strain: float
+    """What was measured in the specimen's own images, and at which strain; None if nothing was."""
     command: str
 
     @property
     def compared(self) -> StateFields | None:
         """The homogenized state at the strain of the measured one."""
-        if self.measured_strain is None:
-            return None
         near = [s for s in self.fields.states if abs(s.load - self.measured_strain) < 1e-9]
-        return near[0] if near else None
+        return near[0] if near and self.measured is not None else None
+
+    def measured_at(self, points: FloatArray) -> FloatArray:
+        """(n,) v1 as it was measured, at points (n, 2) [mm]."""
+        assert self.measured is not None
+        x, y = points.T[..., None]
+        return self.measured.ansatz.v(0, self.measured.unknowns, x, y)[:, 0]
 
 
 def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) -> dict[str, Any]:
@@ -156,9 +169,11 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
                             "states": data.direct.states}),
         "mode": mode and to_plain({
             "kind": case["mode"]["kind"], "wave_change": mode.wave_change, "waves": mode.snapped,
+            "errors": _errors(data.parameters),
         }),
         "sensitivities": found["effects"],
         "amplitude": _amplitude(data),
+        "warnings": list(data.warnings),
         "rves": found["rves"],
         "linearisations": found["linearisations"],
         "files": {
@@ -171,18 +186,29 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
     }  # fmt: skip
 
 
-def _amplitude(data: HomogenizationData) -> dict[str, float] | None:
-    """Rms of the homogenized amplitude, of the measured one, and of their difference [mm]."""
-    state = data.compared
-    if state is None or data.measured is None:
+def _errors(parameters: ModeParameters | None) -> str | None:
+    """What the standard deviations of states count."""
+    if parameters is None:
         return None
-    homogenized, measured = aligned(state.amplitudes[:, 0], data.measured)
-    there = np.isfinite(homogenized) & np.isfinite(measured)
-    a, b = homogenized[there], measured[there]
-    rms = {"homogenized_rms_mm": a, "measured_rms_mm": b, "difference_rms_mm": a - b}
-    return {"nominal_strain": state.load} | {
-        name: float(np.sqrt(np.mean(values**2))) for name, values in rms.items()
-    }
+    return "noise" if parameters.by_model_error is None else "model error"
+
+
+def _amplitude(data: HomogenizationData) -> dict[str, float] | None:
+    """Rms over the lattice of v1 homogenized, measured, and of their difference [mm].
+
+    Over the quadrature points, of a quarter's mirror images too, which stand for areas alike.
+    """
+    state, points = data.compared, data.fields.points
+    if state is None:
+        return None
+    signs = _QUARTERS[: data.fields.copies]
+    measured = np.concatenate([data.measured_at(points * sign) for sign in signs])
+    v = np.tile(state.strains[:, _V], len(signs))
+    homogenized, measured = aligned(v, measured)
+    difference = homogenized - measured
+    values = {"homogenized": homogenized, "measured": measured, "difference": difference}
+    rms = {f"{name}_rms_mm": float(np.sqrt(np.mean(v**2))) for name, v in values.items()}
+    return {"nominal_strain": state.load} | rms
 
 
 def aligned(homogenized: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:

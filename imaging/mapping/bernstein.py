@@ -1,13 +1,4 @@
-"""Reference elements T3, T6, Q4, Q8 and Q9, polynomials over them, and positive Jacobians.
-
-An element is its nodes and the monomials it spans; everything else follows. Over an element
-every field (position, displacement) is one polynomial in the local coordinates (xi, eta), kept
-as nine coefficients in the order
-
-    1, xi, eta, xi^2, xi eta, eta^2, xi^2 eta, xi eta^2, xi^2 eta^2,
-
-so that all element types share the same kernels. Triangles live on xi, eta >= 0,
-xi + eta <= 1; quadrilaterals on -1 <= xi, eta <= 1. Node order: see modeharvest.fem.field.
+"""Bernstein polynomials over reference elements, and positive Jacobians.
 
 That a Jacobian is positive everywhere in an element is proved, not sampled. The determinant is a
 polynomial; if its Bernstein coefficients are positive, so is it. Where they aren't, the element is
@@ -17,100 +8,14 @@ proved. Only then is the element's map one to one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled, in_parallel
+from modeharvest.util.elements import monomial_gradients, monomials, reference_element
 from modeharvest.util.errors import InputError
-
-EXPONENTS = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [2, 1], [1, 2], [2, 2]])
-
-_TRIANGLE = [[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]]
-_SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0], [0, 0]]
-
-
-@dataclass(frozen=True, eq=False)
-class ReferenceElement:
-    """One element type."""
-
-    triangular: bool
-    """Whether the reference domain is the triangle (else the square)."""
-    nodes: FloatArray
-    """(k, 2) local coordinates (xi, eta) of the nodes [-]."""
-    monomials: tuple[int, ...]
-    """Which k of the nine monomials the element spans."""
-    coefficients: FloatArray = field(init=False)
-    """(9, k); column a holds the coefficients of node a's shape function."""
-
-    def __post_init__(self) -> None:
-        full = np.zeros((9, len(self.nodes)))
-        full[list(self.monomials)] = np.linalg.inv(monomials(self.nodes)[:, self.monomials])
-        # The exact values are multiples of 1/4; the inversion may leave rounding behind.
-        object.__setattr__(self, "coefficients", np.round(full * 4.0) / 4.0)
-
-    @property
-    def middle(self) -> float:
-        """Both local coordinates of the reference domain's middle."""
-        return 1.0 / 3.0 if self.triangular else 0.0
-
-
-def monomials(xi: ArrayLike) -> FloatArray:
-    """(..., 9) values of the nine monomials at local coordinates (..., 2)."""
-    xi = np.asarray(xi, dtype=np.float64)
-    return np.asarray(xi[..., :1] ** EXPONENTS[:, 0] * xi[..., 1:] ** EXPONENTS[:, 1])
-
-
-def monomial_gradients(xi: ArrayLike) -> FloatArray:
-    """(..., 9, 2) derivatives of the nine monomials along xi and eta at (..., 2)."""
-    xi = np.asarray(xi, dtype=np.float64)
-    i, j = EXPONENTS.T
-    along_xi = i * xi[..., :1] ** np.maximum(i - 1, 0) * xi[..., 1:] ** j
-    along_eta = j * xi[..., :1] ** i * xi[..., 1:] ** np.maximum(j - 1, 0)
-    return np.stack([along_xi, along_eta], axis=-1)
-
-
-def _make(triangular: bool, spanned: tuple[int, ...]) -> ReferenceElement:
-    nodes = np.array(_TRIANGLE if triangular else _SQUARE, dtype=np.float64)[: len(spanned)]
-    return ReferenceElement(triangular, nodes, spanned)
-
-
-_ELEMENTS = {
-    "T3": _make(True, (0, 1, 2)),
-    "T6": _make(True, (0, 1, 2, 3, 4, 5)),
-    "Q4": _make(False, (0, 1, 2, 4)),
-    "Q8": _make(False, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "Q9": _make(False, (0, 1, 2, 3, 4, 5, 6, 7, 8)),
-}
-
-
-def reference_element(name: str) -> ReferenceElement:
-    """Look up a reference element by its name; InputError if there is none."""
-    try:
-        return _ELEMENTS[name]
-    except KeyError:
-        raise InputError(f"expected an element among {list(_ELEMENTS)}, got {name!r}") from None
-
-
-def shape_functions(name: str, xi: ArrayLike) -> FloatArray:
-    """(..., k) shape functions of element ``name`` at local coordinates (..., 2)."""
-    return np.asarray(monomials(xi) @ reference_element(name).coefficients)
-
-
-def shape_gradients(name: str, xi: ArrayLike) -> FloatArray:
-    """(..., k, 2) derivatives of the shape functions along xi and eta at (..., 2)."""
-    coefficients = reference_element(name).coefficients
-    return np.asarray(np.einsum("...mi,mk->...ki", monomial_gradients(xi), coefficients))
-
-
-def polynomials(name: str, cells: IntArray, nodal: FloatArray) -> FloatArray:
-    """(m, c, 9) coefficients, over each cell (m, k), of a nodal field (n, c)."""
-    per_cell = np.ascontiguousarray(nodal[cells].transpose(0, 2, 1), dtype=np.float64)
-    flat = per_cell.reshape(-1, cells.shape[1]) @ reference_element(name).coefficients.T
-    return flat.reshape(len(cells), nodal.shape[1], 9)
 
 
 def lattice_points(triangular: bool, degree: int) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Isoparametric plane elements of a homogenized body: shape functions, quadrature, meshes."""
+"""Meshes of a homogenized body, and Gauss points over them."""
 
 from __future__ import annotations
 
@@ -10,17 +10,9 @@ import numpy as np
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.elements import reference_element, shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
 
-_QUAD = [(-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0), (0, 0)]
-_TRIANGLE = [(0, 0), (1, 0), (0, 1), (0.5, 0), (0.5, 0.5), (0, 0.5)]
-_POWERS = {
-    "T3": [(0, 0), (1, 0), (0, 1)],
-    "T6": [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)],
-    "Q4": [(0, 0), (1, 0), (0, 1), (1, 1)],
-    "Q8": [(0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2), (2, 1), (1, 2)],
-    "Q9": [(0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2), (2, 1), (1, 2), (2, 2)],
-}
 # Of Gauss points on a triangle, for degrees 2 and 4: barycentric coordinate a of (a, a, 1 - 2 a).
 _TRIANGLE_RULES = {
     2: [(1 / 6, 1 / 6)],
@@ -57,7 +49,7 @@ def quadrature(mesh: Mesh, points: int) -> Quadrature:
         rule = _TRIANGLE_RULES[points]
         xi = np.array([p for a, _ in rule for p in ((a, a), (a, 1 - 2 * a), (1 - 2 * a, a))])
         weights = np.repeat([w for _, w in rule], 3)
-    shapes, slopes = _shape_functions(mesh.element, xi)
+    shapes, slopes = shape_functions(mesh.element, xi), shape_gradients(mesh.element, xi)
     nodes = mesh.nodes[mesh.cells]
     J = np.einsum("pkb,cka->cpab", slopes, nodes)
     area = np.linalg.det(J)
@@ -71,18 +63,6 @@ def quadrature(mesh: Mesh, points: int) -> Quadrature:
     return Quadrature(weights * area, shapes, gradients, np.einsum("pk,cka->cpa", shapes, nodes))
 
 
-def _shape_functions(element: str, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(p, k) shape functions and (p, k, 2) their derivatives at reference points (p, 2)."""
-    m, n = np.array(_POWERS[element]).T
-    nodes = np.array((_QUAD if element[0] == "Q" else _TRIANGLE)[: len(m)], dtype=np.float64)
-    coefficients = np.linalg.inv(nodes[:, :1] ** m * nodes[:, 1:] ** n)
-    x, y = xi[:, :1], xi[:, 1:]
-    of_x = m * x ** np.maximum(m - 1, 0) * y**n
-    of_y = n * x**m * y ** np.maximum(n - 1, 0)
-    slopes = np.stack([of_x @ coefficients, of_y @ coefficients], axis=-1)
-    return x**m * y**n @ coefficients, slopes
-
-
 def rectangle_mesh(x: Sequence[float], y: Sequence[float]) -> Mesh:
     """Q8 elements between ascending places along x and along y [mm]."""
     at = []
@@ -93,7 +73,8 @@ def rectangle_mesh(x: Sequence[float], y: Sequence[float]) -> Mesh:
         at.append(np.sort(np.concatenate([ends, 0.5 * (ends[1:] + ends[:-1])])))
     columns, rows = len(at[0]), len(at[1])
     i, j = np.meshgrid(np.arange(0, columns - 1, 2), np.arange(0, rows - 1, 2), indexing="ij")
-    numbers = [((i + a + 1) * rows + j + b + 1).ravel() for a, b in _QUAD[:8]]
+    local = reference_element("Q8").nodes.astype(int)
+    numbers = [((i + a + 1) * rows + j + b + 1).ravel() for a, b in local]
     grid = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1).reshape(-1, 2)
     used, cells = np.unique(np.stack(numbers, axis=1), return_inverse=True)
     return Mesh(grid[used], cells.reshape(-1, 8), "Q8")
