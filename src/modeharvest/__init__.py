@@ -13,12 +13,13 @@ What most scripts need is here, each name loaded when it is first used::
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from modeharvest.util import __version__
-from modeharvest.util.errors import dolfinx_missing
 
+TYPE_CHECKING = False  # typing's own takes longer to import than everything here
 if TYPE_CHECKING:  # what type checkers and editors see of the table below
+    from typing import Any
+
     from modeharvest.fem.experiment import Experiment
     from modeharvest.fem.field import Solution
     from modeharvest.fem.materials import Ogden
@@ -57,6 +58,8 @@ def __getattr__(name: str) -> Any:
         module = import_module(f"{__name__}.{_HOMES[name]}")
     except ModuleNotFoundError as error:
         if name == "simulate":
+            from modeharvest.util.errors import dolfinx_missing
+
             raise dolfinx_missing("simulate needs") from error
         raise
     value = globals()[name] = getattr(module, name)
