@@ -9,6 +9,8 @@ docs/homogenization.md, as Markdown:
   positions of the lattice against the plates), and homogenized ones.
 - ``specimen``: the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
 - ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.
+- ``positions``: means over N x N centres of the RVE, spread evenly over a cell, N = 1 to 4, of
+  strips and specimens.
 - ``cost``: seconds and memory a linearisation and RVE, from 60 to 10 000 RVEs.
 
 Everything has square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material, elements of
@@ -75,6 +77,12 @@ def supercell() -> UnitCell:
 @cache
 def analytic(centre: tuple[float, float] = JUNCTION) -> RVE:
     return RVE(supercell(), MATERIAL, [PATTERN], centre)
+
+
+def centred(n: int) -> list[RVE]:
+    """Of n x n positions: the centres of as many equal parts of a cell."""
+    at = PITCH * (np.arange(n) + 0.5) / n
+    return [analytic((float(x), float(y))) for x in at for y in at]
 
 
 @cache
@@ -146,7 +154,7 @@ def direct_strip(cells: int, is_cut: bool) -> tuple[float, list[float]]:
     return critical.strain, [structure.reaction(s.u, length) / PITCH for s in states]
 
 
-def homogenized_strip(cells: int, rve: RVE) -> tuple[float, list[float]]:
+def homogenized_strip(cells: int, rve: RVE | list[RVE]) -> tuple[float, list[float]]:
     specimen = Specimen(cells, 2, bulk_x=0, bulk_y=0)
     body = HomogenizedBody.of_specimen(
         specimen, rve, PlateLoading(sides="periodic"), divisions=(cells, 1)
@@ -253,8 +261,7 @@ def choices() -> None:
 
     case("as above", analytic())
     case("centre on a hole", analytic(HOLE))
-    grid = [(PITCH * (i + 0.5) / 2, PITCH * (j + 0.5) / 2) for i in (0, 1) for j in (0, 1)]
-    case("mean over 2 x 2 centres in a cell", [analytic(centre) for centre in grid])
+    case("mean over 2 x 2 centres in a cell", centred(2))
     case("v free at bulk", analytic(), pattern_at_bulk="free")
     case("Bloch φ", computed())
     sine = PATTERN.sine
@@ -264,6 +271,34 @@ def choices() -> None:
         ("φ moved by l/20 both ways", PATTERN.moved((0.05 * PITCH, 0.05 * PITCH))),
     ):
         case(name, RVE(supercell(), MATERIAL, [change], JUNCTION))
+
+
+def positions() -> None:
+    head("body", "N x N", "RVEs", "ε_c", "stress at 8 and 10 % or energy, force")
+    for n in (4, 6, 12):
+        both = [direct_strip(n, is_cut) for is_cut in (False, True)]
+        exact = np.mean([e for e, _ in both])
+        stress = np.mean([s for _, s in both], axis=0)
+        for count in (1, 2, 3, 4):
+            e, found = homogenized_strip(n, centred(count))
+            changes = ", ".join(f"{x:+.2%}" for x in found / stress - 1)
+            name = f"strip, {n} cells"
+            row(name, f"{count} x {count}", "", f"{100 * e:.3f} ({e / exact - 1:+.2%})", changes)
+    for size, parts, load in (((6, 10), (4, 6), 0.128), ((6, 10), (6, 10), 0.128),
+                              ((12, 10), (7, 6), 0.127)):  # fmt: skip
+        state = (direct := simulate(Experiment(Specimen(*size), strains=(load,)))).at(load)
+        exact = direct.info["critical"]["strain"]
+        for count in (1, 2, 3, 4):
+            found, body, _ = homogenized_specimen(
+                centred(count), size, parts, (load,), quarter=True
+            )
+            e, reached = found.critical.load if found.critical else np.nan, found.states[-1]
+            row(
+                f"{size[0]} x {size[1]}, {load:.1%}", f"{count} x {count}",
+                body.point_count * count**2, f"{e:.3%} ({e / exact - 1:+.2%})",
+                f"{reached.energy / state.energy - 1:+.2%}, "
+                f"{reached.force / state.reaction - 1:+.2%}",
+            )  # fmt: skip
 
 
 def cost() -> None:
@@ -294,7 +329,8 @@ def cost() -> None:
 
 
 SECTIONS: dict[str, Callable[[], None]] = {
-    "cell": cell, "strips": strips, "specimen": specimen, "choices": choices, "cost": cost,
+    "cell": cell, "strips": strips, "specimen": specimen, "choices": choices,
+    "positions": positions, "cost": cost,
 }  # fmt: skip
 
 

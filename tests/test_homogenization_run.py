@@ -251,6 +251,26 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
         early.all()
 
 
+@pytest.mark.dolfinx
+@pytest.mark.parametrize(("centre", "middle"), [("junction", 0.5), ("hole", 0.0)])
+@pytest.mark.parametrize("positions", [1, 2, 3])
+def test_positions_are_spread_evenly_over_a_cell(
+    tmp_path: Path, centre: str, middle: float, positions: int
+) -> None:
+    table = f'[homogenization]\ncentre = "{centre}"\npositions = {positions}\n'
+    text = SMALL.replace("[homogenization]\n", table)
+    case = case_of(tmp_path / "case.toml", text)
+    pitch = case.experiment.specimen.pitch
+    body = HomogenizationRun(case, tmp_path)._body([rotation_pattern(pitch)])
+    centres = np.array([rve.centre for rve in body.rves]) / pitch
+    assert centres.shape == (positions**2, 2)
+    assert centres.mean(axis=0) == pytest.approx([middle, middle])
+    # Waves of a cell's period shorter than the number of positions vanish in the mean.
+    for order in range(1, positions):
+        mean = np.exp(2j * np.pi * order * centres).mean(axis=0)
+        assert np.abs(mean) == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
 def case_of(path: Path, text: str) -> HomogenizationCase:
     path.write_text(text, "utf-8")
     return HomogenizationCase.read(path)

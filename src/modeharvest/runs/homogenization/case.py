@@ -64,6 +64,9 @@ class HomogenizationOptions:
 
     centre: Literal["junction", "hole"] = "junction"
     """About which the RVE of 2 x 2 cells is cut."""
+    positions: int = 1
+    """RVEs along x and y at each point, whose mean counts: centred there and a ``positions``-th of
+    a cell apart."""
     mesh_size: float = 0.2
     """Edge length of the RVE's elements [mm]."""
     pattern_at_plates: Literal["zero", "free"] = "zero"
@@ -82,6 +85,7 @@ class HomogenizationOptions:
     def __post_init__(self) -> None:
         what = "homogenization: expected"
         require_within(f"{what} mesh_size", self.mesh_size, 0.0, above=True)
+        require_within(f"{what} positions", self.positions, 1, 10)
         for number in self.divisions or ():
             require_within(f"{what} divisions", number, 1, 1000)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -121,7 +122,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                 "effects": effects,
                 "criticals": [picked(c, _CRITICAL) for c in found.criticals],
                 "first_order_critical_strain": first and first.critical and first.critical.load,
-                "rves": body.point_count,
+                "rves": body.point_count * len(body.rves),
                 "linearisations": found.linearisations,
             }))  # fmt: skip
             write_fields(found, body, fields)
@@ -262,20 +263,24 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         return list(real_modes(cell, critical.state, [(np.pi, np.pi)]).shapes)
 
     def _body(self, modes: Sequence[ModeField]) -> HomogenizedBody:
-        """The macroscopic finite elements with their RVE."""
+        """The macroscopic finite elements with their RVEs."""
         experiment, how, cell = self.case.experiment, self.case.homogenization, self._cell
         from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
         from modeharvest.fem.lattice.micromorphic.rve import RVE
 
-        half = 0.5 * experiment.specimen.pitch
-        centre = (half, half) if how.centre == "junction" else (0.0, 0.0)
-        element = RVE(cell, experiment.material, modes, centre, normalisation="given")
+        pitch, n = experiment.specimen.pitch, how.positions
+        middle = 0.5 * pitch if how.centre == "junction" else 0.0
+        places = middle + pitch * (np.arange(n) + 0.5 - 0.5 * n) / n
+        rves = [
+            RVE(cell, experiment.material, modes, centre, normalisation="given")
+            for centre in product(places, places)
+        ]
         loading = PlateLoading(
             plates=experiment.edges, quarter=how.quarter,
             pattern_at_plates=how.pattern_at_plates, pattern_at_bulk=how.pattern_at_bulk,
         )  # fmt: skip
         return HomogenizedBody.of_specimen(
-            experiment.specimen, element, loading, divisions=how.divisions
+            experiment.specimen, rves, loading, divisions=how.divisions
         )
 
     def _followed(self, body: HomogenizedBody, what: str) -> Homogenized:

@@ -91,7 +91,7 @@ class HomogenizedFields:
     mesh: Mesh
     """Macroscopic, of the whole specimen [mm]."""
     rve: Mesh
-    """From its middle [mm]."""
+    """Of the first RVE at a point, from its middle [mm]."""
     points: FloatArray
     """(p, 2) where the RVEs are [mm]; of a quarter its own."""
     copies: int
