@@ -433,6 +433,7 @@ def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:
 
 def print_report(report: Report, out: Path) -> None:
     """Print findings, tables and warnings; where the page is, last."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -443,12 +444,15 @@ def print_report(report: Report, out: Path) -> None:
         console.print(f"- {escape(text)}", soft_wrap=True)
     brief = [report.brief] if report.brief else []
     for table in (*brief, *(table for table in report.tables if table.on_terminal)):
-        printed = Table(title=escape(table.title), title_justify="left")
+        title = escape(table.title)
+        printed = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
         lines: list[Sequence[Cell]] = [table.columns, *table.rows]
         is_wide = len(lines) < len(lines[0])  # few long rows: turned, so that they fit
         heads, *rows = zip(*lines, strict=True) if is_wide else lines
         for n, head in enumerate(heads):
-            printed.add_column(escape(number(head)), justify="right" if n else "left")
+            printed.add_column(
+                escape(number(head)), justify="right" if n else "left", overflow="fold"
+            )  # no number is cut
         for row in rows:
             printed.add_row(*(escape(number(cell)) for cell in row))
         console.print(printed)
