@@ -3,11 +3,10 @@
 For every d/l a 6 x 10 specimen is compressed until its pattern is as strong as the paper's at
 12.8 %, photographed as there without noise and with it, and the mode is measured in the images.
 Homogenization with that mode (a quarter, 24 RVEs) predicts the critical strain, the force at that
-strain and v1 in the specimen's middle. Three tables, as Markdown:
+strain and the rms of v1. Three tables, as Markdown:
 
 - what it predicts with the noise-free mode, beside the direct simulation;
-- parameter by parameter what 1 % of error (of a wave number; of a wave length, for phases) makes of
-  the prediction if the mode is used *as it was measured*, up or down, whichever does more, and
+- parameter by parameter what an error of 1 % (of l for phases) makes of the prediction if the mode is used *as it was measured*, up or down, whichever does more, and
   which error makes 1 % of the force.
   Amplitudes act everywhere, phases are those in the specimen's middle. An error of a wave number
   shifts the pattern the more the farther it is from there: what is said is what it does at the ends
