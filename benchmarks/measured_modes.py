@@ -6,11 +6,11 @@ Homogenization with that mode (a quarter, 24 RVEs) predicts the critical strain,
 strain and the rms of v1. Three tables, as Markdown:
 
 - what it predicts with the noise-free mode, beside the direct simulation;
-- parameter by parameter what an error of 1 % (of l for phases) makes of the prediction if the mode is used *as it was measured*, up or down, whichever does more, and
-  which error makes 1 % of the force.
-  Amplitudes act everywhere, phases are those in the specimen's middle. An error of a wave number
-  shifts the pattern the more the farther it is from there: what is said is what it does at the ends
-  of the cellular part along x or y;
+- parameter by parameter what an error of 1 % (of l for phases) makes of the prediction if the mode
+  is used *as it was measured*, up or down, whichever does more, and which error makes 1 % of the
+  force. Amplitudes act everywhere, phases are those in the specimen's middle. An error of a wave
+  number shifts the pattern the more the farther it is from there: what is said is what it does at
+  the ends of the cellular part along x or y;
 - for each noise the rms error of the parameters over the seeds (from the noise-free measurement),
   the mean of their standard deviations by noise and by model error, and the errors of the
   prediction that are left once the mode is snapped to the lattice.

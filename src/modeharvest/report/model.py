@@ -444,18 +444,18 @@ def print_report(report: Report, out: Path) -> None:
         console.print(f"- {escape(text)}", soft_wrap=True)
     brief = [report.brief] if report.brief else []
     for table in (*brief, *(table for table in report.tables if table.on_terminal)):
-        title = escape(table.title)
-        printed = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        console.print()
+        shown = Table(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD,
+                        show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))  # fmt: skip
         lines: list[Sequence[Cell]] = [table.columns, *table.rows]
         is_wide = len(lines) < len(lines[0])  # few long rows: turned, so that they fit
         heads, *rows = zip(*lines, strict=True) if is_wide else lines
-        for n, head in enumerate(heads):
-            printed.add_column(
-                escape(number(head)), justify="right" if n else "left", overflow="fold"
-            )  # no number is cut
+        for n, head in enumerate(map(number, heads)):
+            shown.add_column(escape(head), justify="right" if n else "left", overflow="fold")
         for row in rows:
-            printed.add_row(*(escape(number(cell)) for cell in row))
-        console.print(printed)
+            shown.add_row(*(escape(number(cell)) for cell in row))
+        console.print(shown)
+    console.print()
     for warning in report.warnings:
         console.print(f"[yellow]warning:[/yellow] {escape(warning)}", soft_wrap=True)
     console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
