@@ -11,45 +11,66 @@ docs/homogenization.md, as Markdown:
 - ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.
 - ``positions``: means over N x N centres of the RVE, spread evenly over a cell, N = 1 to 4, of
   strips and specimens.
+- ``flower``: three modes of triangular stacking under equibiaxial load, computed, analytic and
+  measured in an image: all branches by energy, against those of the periodic cell.
+- ``loads``: sides, shear and bending: against Bloch waves, and a specimen bent as it is compressed
+  against its direct simulation.
+- ``triangular``: a specimen of triangular stacking, direct and homogenized.
 - ``cost``: seconds and memory a linearisation and RVE, from 60 to 10 000 RVEs.
 
-Everything has square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material, elements of
-0.2 mm. All sections together take about a quarter of an hour.
+What isn't said otherwise has square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material,
+elements of 0.2 mm. All sections together take about half an hour.
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from modeharvest.fem.bloch.critical import first_critical
-from modeharvest.fem.bloch.modes import ModeSet
+from modeharvest.fem.bloch.critical import critical_at, first_critical
+from modeharvest.fem.bloch.modes import BranchState, ModeSet
 from modeharvest.fem.bloch.postbuckling import follow
 from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.experiment import Experiment, PathOptions
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
-from modeharvest.fem.lattice.cells import UnitCell, square
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
+from modeharvest.fem.lattice.micromorphic.mesh import rectangle_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
-from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern
+from modeharvest.fem.lattice.micromorphic.patterns import ModeField, PlaneWaves, rotation_pattern
 from modeharvest.fem.lattice.micromorphic.rve import RVE
-from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxial, uniaxial_strain
-from modeharvest.fem.materials import Ogden
-from modeharvest.fem.meshing import SIGNS, join, quarter_cell
+from modeharvest.fem.lattice.options import (
+    CriticalSearch,
+    MacroLoading,
+    equibiaxial,
+    uniaxial,
+    uniaxial_strain,
+)
+from modeharvest.fem.materials import Ogden, TwoTermI1
+from modeharvest.fem.meshing import SIGNS, MeshBlock, join, quarter_cell
 from modeharvest.fem.path.bifurcation import follow_branch, locate_critical
 from modeharvest.fem.path.continuation import PathFollower
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.validation.homogenization import LatticeMode
 
 FloatArray = NDArray[np.float64]
 PITCH, DIAMETER, SIZE = 1.9, 1.5, 0.2
@@ -301,6 +322,194 @@ def positions() -> None:
             )  # fmt: skip
 
 
+HEXAGONAL = Specimen(7, 7, 1.28, 1.386, bulk_x=0.0, bulk_y=0.0, stacking="triangular")
+"""The lattice of the case hexagonal-lattice; 46 holes for the image that shows its modes."""
+SOFT = TwoTermI1()
+FLOWER_LOADS = (0.0075, 0.01, 0.015, 0.02)
+COMBINATIONS = ((1.0, 1.0, 1.0), (1.0, 1.0, 0.0), (1.0, 0.0, 0.0))
+
+
+def flower() -> None:
+    primitive = PeriodicCell(hexagonal(HEXAGONAL.pitch, HEXAGONAL.diameter, 0.2), SOFT)
+    critical = first_critical(CellPath(primitive, equibiaxial()), CriticalSearch(divisions=2))
+    modes = real_modes(primitive, critical.state, critical.waves)
+    four = UnitCell(modes.mesh, modes.lattice)
+    branches = [
+        follow(CellPath(PeriodicCell(four, SOFT), equibiaxial()), modes, c, FLOWER_LOADS).states
+        for c in COMBINATIONS
+    ]
+    waves = [
+        LatticeMode.of(m, m.family.start, HEXAGONAL, modes.lattice).snapped
+        for m in Ansatz.of_specimen(HEXAGONAL).modes
+    ]
+    kinds: dict[str, Sequence[ModeField]] = {
+        "Bloch": list(modes.shapes),
+        "analytic": waves,
+        "measured": measured_flower(modes, branches[0][-1]),
+    }
+    names = ("flower", "two modes", "one mode")
+    head(
+        "φ", "ε_c", "from Bloch waves", "at e", "branches",
+        *(f"{n}: energy over the lattice's - 1, negative eigenvalues" for n in names),
+    )  # fmt: skip
+    for name, fields in kinds.items():
+        rve = RVE(four, SOFT, fields, HOLE)
+        pressed = PlateLoading(sides="periodic", lateral=1.0, pattern_at_plates="free")
+        body = HomogenizedBody(rectangle_mesh([0, 1], [0, 1]), rve, pressed)
+        for k, load in enumerate(FLOWER_LOADS):
+            found = homogenize(body, [load], PathOptions(first_step=0.003, largest_step=0.003))
+            assert found.critical is not None
+            e, ranked = found.critical.load, dict(found.ranked)
+            order = [sum(v != 0 for v in pattern) for pattern in ranked]
+            assert order == sorted(order, reverse=True), "the flower first, single modes last"
+            values = [
+                f"{ranked[c].energy / b[k].energy - 1:.1e}, {ranked[c].negative_eigenvalues}"
+                for c, b in zip(COMBINATIONS, branches, strict=True)
+            ]
+            row(
+                name, f"{e:.5%}", f"{e / critical.load - 1:.1e}", f"{load:.2%}", len(order), *values
+            )
+
+
+def measured_flower(modes: ModeSet, state: BranchState) -> list[ModeField]:
+    """phi_i as IDIC finds them in an image of the flower, snapped to the lattice."""
+    cell = hexagonal(HEXAGONAL.pitch, HEXAGONAL.diameter, 0.2)
+    centres = HEXAGONAL.hole_centres
+    blocks = [MeshBlock(cell.mesh.nodes + at, cell.mesh.cells) for at in centres]
+    mesh = join(blocks, 1e-7 * HEXAGONAL.pitch)
+    steps = np.array(list(product(range(-4, 5), repeat=2))) @ modes.lattice
+    places = cKDTree((modes.mesh.nodes + steps[:, None]).reshape(-1, 2))
+    hole = centres[np.argmin(np.linalg.norm(centres, axis=1))]
+    distance, number = places.query(mesh.nodes - hole)
+    assert distance.max() < 1e-6, "the specimen's nodes are the lattice's"
+    fluctuation = state.fluctuation(modes.mesh)[number % len(modes.mesh.nodes)]
+    u = fluctuation + mesh.nodes @ (state.gradient - np.eye(2)).T
+    solution = Solution(mesh, (Snapshot(state.load, u, branch="buckled+"),), {})
+    with tempfile.TemporaryDirectory() as folder:
+        spec = ImagingSpec(pixel_size=0.01)
+        (pair,) = make_images(solution, spec, folder, (state.load,))
+    result = correlate(pair, Ansatz.of_specimen(HEXAGONAL, options=AnsatzOptions(v_degree=3)))
+    found = [
+        LatticeMode.of(m, result.mode_parameters(i), HEXAGONAL, modes.lattice)
+        for i, m in enumerate(result.ansatz.modes)
+    ]
+    amplitudes = identifiability(result, pair.mask).amplitude_px
+    print("\nmeasured:", result.outcome.value, "; L1, T2, wave change, rms:", "; ".join(
+        f"{p[0]:.3f}, {p[1]:.3f}, {m.wave_change.max():.2%}, {a:.2f} px"
+        for p, m, a in zip(
+            map(result.mode_parameters, range(3)), found, amplitudes, strict=True
+        )
+    ))  # fmt: skip
+    return [mode.snapped for mode in found]
+
+
+def loads() -> None:
+    head("homogeneous strain", "sides", "ε_c", "Bloch waves", "difference")
+    primitive = PeriodicCell(square(PITCH, DIAMETER, SIZE), MATERIAL)
+    one = Specimen(4, 2, bulk_x=0, bulk_y=0)
+    for name, (c, shear, lateral), sides in (
+        ("compression", (1.0, 0.0, 0.0), "periodic"),
+        ("compression", (1.0, 0.0, 0.0), "clamped"),
+        ("equibiaxial", (1.0, 0.0, 1.0), "guided"),
+        ("compression, shear 0.5", (1.0, 0.5, 0.0), "periodic"),
+        ("compression, shear 0.5, across 0.3", (1.0, 0.5, 0.3), "clamped"),
+    ):
+        macro = MacroLoading(((-c, 0.0), (shear, -lateral)))
+        exact = critical_at(CellPath(primitive, macro), (np.pi, np.pi)).load
+        held = PlateLoading(c, shear, 0.0, lateral, sides=sides, pattern_at_plates="free")
+        body = HomogenizedBody.of_specimen(one, analytic(), held, divisions=(1, 1))
+        found = homogenize(body, [1.05 * exact]).critical
+        e = found.load if found else np.nan
+        row(name, sides, f"{e:.6%}", f"{exact:.6%}", f"{e / exact - 1:.1e}")
+
+    D = LinearisedBody(body, 0.0, body.start).moduli[0]  # relaxed at rest
+    modulus = D[0, 0] - D[0, 3] ** 2 / D[3, 3]
+    head("pure bending of a beam at 0.1 % in the outer fibre", "energy [N]", "E b e² L / 3", "off")
+    bent = PlateLoading(0.0, 0.0, 1.0, plates="sliding")
+    body = HomogenizedBody.of_specimen(
+        Specimen(6, 4, bulk_x=0, bulk_y=0), analytic(), bent, divisions=(3, 2)
+    )
+    energy = homogenize(body, [1e-3]).states[0].energy
+    exact = modulus * 2 * PITCH * 1e-6 * body.length / 3
+    row("6 x 4 cells", f"{energy:.6e}", f"{exact:.6e}", f"{energy / exact - 1:.1e}")
+
+    strains = (0.03, 0.05, 0.06, 0.07, 0.08)
+    head(
+        "6 x 10, one plate turned by 1 rad a unit of strain", "RVEs", "ε_c",
+        *(f"energy, force at {e:.0%}" for e in strains), "negative eigenvalues", "s",
+    )  # fmt: skip
+    start = time.perf_counter()
+    direct = simulate(Experiment(Specimen(), strains=strains, tilt=1.0))
+    states = [direct.at(e) for e in strains]
+    seconds = time.perf_counter() - start
+    row(
+        "direct", "", "", *(f"{s.energy:.5f} N, {s.reaction:.5f} N/mm" for s in states),
+        ", ".join(str(s.negative_pivots) for s in states), f"{seconds:.0f}",
+    )  # fmt: skip
+    for parts in ((3, 5), (6, 10)):
+        body = HomogenizedBody.of_specimen(Specimen(), analytic(), PlateLoading(), divisions=parts)
+        shortening = tilted(body, 1.0)
+        start = time.perf_counter()
+        found = homogenize(body, strains)
+        seconds = time.perf_counter() - start
+        forces = [
+            LinearisedBody(body, s.load, s.value).forces @ shortening / body.length
+            for s in found.states
+        ]
+        critical = found.critical.load if found.critical else np.nan
+        values = [
+            f"{h.energy / s.energy - 1:+.2%}, {force / s.reaction - 1:+.2%}"
+            for h, force, s in zip(found.states, forces, states, strict=False)
+        ]
+        unstable = ", ".join(str(h.negative_eigenvalues) for h in found.states)
+        values += [""] * (len(states) - len(values))
+        row("homogenized", body.point_count, f"{critical:.3%}", *values, unstable, f"{seconds:.0f}")
+
+
+def tilted(body: HomogenizedBody, tilt: float) -> FloatArray:
+    """Turn the right plate, per unit of strain [rad]; the rates of all unknowns without that."""
+    shortening, nodes = body.direction.copy(), body.mesh.nodes
+    right = np.flatnonzero(nodes[:, 0] > nodes[:, 0].max() - 1e-9)
+    body.direction[right * (2 + body.mode_count)] -= tilt * nodes[right, 1]
+    return shortening
+
+
+def triangular() -> None:
+    strains, specimen = (0.06, 0.08, 0.1), Specimen(8, 17, 1.68, stacking="triangular")
+    start = time.perf_counter()
+    direct = simulate(Experiment(specimen, strains=strains, mesh_size=0.3))
+    states = [direct.at(e) for e in strains]
+    seconds, exact = time.perf_counter() - start, direct.info["critical"]["strain"]
+    head(
+        "8 x 17, triangular", "RVEs", "ε_c",
+        *(f"energy, force at {e:.0%}" for e in strains), "negative eigenvalues", "s",
+    )  # fmt: skip
+    row(
+        "direct", "", f"{exact:.3%}", *(f"{s.energy:.5f} N, {s.reaction:.5f} N/mm" for s in states),
+        ", ".join(str(s.negative_pivots) for s in states), f"{seconds:.0f}",
+    )  # fmt: skip
+    four = hexagonal(specimen.pitch, specimen.diameter, 0.3).enlarged(2, 2)
+    waves = [
+        LatticeMode.of(m, m.family.start, specimen, four.lattice).snapped
+        for m in Ansatz.of_specimen(specimen).modes
+    ]
+    for name, modes in (("φ₁, φ₂, φ₃", waves), ("φ₁, φ₃", waves[::2]), ("first order", [])):
+        rve = RVE(four, MATERIAL, modes, HOLE)
+        body = HomogenizedBody.of_specimen(specimen, rve, PlateLoading(), divisions=(4, 8))
+        start = time.perf_counter()
+        found = homogenize(body, strains)
+        seconds = time.perf_counter() - start
+        critical = found.critical.load if found.critical else np.nan
+        values = [
+            f"{h.energy / s.energy - 1:+.2%}, {h.force / s.reaction - 1:+.2%}"
+            for h, s in zip(found.states, states, strict=False)
+        ]
+        values += [""] * (len(states) - len(values))
+        unstable = ", ".join(str(h.negative_eigenvalues) for h in found.states)
+        ratio = f"{critical:.3%} ({critical / exact - 1:+.1%})"
+        row(name, body.point_count, ratio, *values, unstable, f"{seconds:.0f}")
+
+
 def cost() -> None:
     head(
         "RVEs",
@@ -330,7 +539,8 @@ def cost() -> None:
 
 SECTIONS: dict[str, Callable[[], None]] = {
     "cell": cell, "strips": strips, "specimen": specimen, "choices": choices,
-    "positions": positions, "cost": cost,
+    "positions": positions, "flower": flower, "loads": loads, "triangular": triangular,
+    "cost": cost,
 }  # fmt: skip
 
 

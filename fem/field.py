@@ -34,7 +34,7 @@ COMPRESSED = {"compression": 6, "shuffle": True}
 """Of datasets in HDF5."""
 _CORNERS = {"T3": 3, "T6": 3, "Q4": 4, "Q8": 4, "Q9": 4}
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
-_MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
+MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +196,7 @@ def in_space(mesh: Mesh, fields: Mapping[str, FloatArray]) -> meshio.Mesh:
         return spatial if values.ndim < 3 else spatial.reshape(len(values), 9)
 
     data = {name: padded(values) for name, values in fields.items()}
-    cells = [(_MESHIO_NAME[mesh.element], mesh.cells)]
+    cells = [(MESHIO_NAME[mesh.element], mesh.cells)]
     return meshio.Mesh(padded(mesh.nodes), cells, point_data=data)
 
 
@@ -237,14 +237,16 @@ def _read_snapshot(group: h5py.Group) -> Snapshot:
 
 
 def read_any_mesh(path: Path | str) -> meshio.Mesh:
-    """Points, cells and nodal fields of a file of any format that meshio knows."""
+    """Points, cells, named sets of these and nodal fields of a file that meshio reads."""
     what, remedy = "a mesh that meshio reads", "export it again"
     found = read_in_child("mesh", path, what, remedy)
     with reading(path, what, remedy):
         named = [(name.split("/", 2), values) for name, values in found.items()]
         cells = [(name[2], values) for name, values in named if name[0] == "cells"]
         fields = {"/".join(name[1:]): v for name, v in named if name[0] == "point_data"}
-        return meshio.Mesh(found["points"], cells, point_data=fields)
+        names = {name[2] for name, _ in named if name[0] == "cell_sets"}
+        sets = {n: [found.get(f"cell_sets/{k}/{n}", ()) for k in range(len(cells))] for n in names}
+        return meshio.Mesh(found["points"], cells, point_data=fields, cell_sets=sets)
 
 
 def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> Solution:
@@ -255,7 +257,7 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     read, has no such cells or several types of them, or no such field.
     """
     source = read_any_mesh(path)
-    mesh = _plane_mesh(source, path)
+    mesh = plane_mesh(source, path)
     if displacement not in source.point_data:
         names = list(source.point_data)
         raise InputError(f"expected a nodal field {displacement!r} in {path}, got {names}")
@@ -271,15 +273,16 @@ def read_plane_mesh(path: Path | str) -> Mesh:
 
     InputError if the file can't be read, or has no such cells or several types of them.
     """
-    return _plane_mesh(read_any_mesh(path), path)
+    return plane_mesh(read_any_mesh(path), path)
 
 
-def _plane_mesh(source: meshio.Mesh, path: Path | str) -> Mesh:
+def plane_mesh(source: meshio.Mesh, path: Path | str) -> Mesh:
+    """What :func:`read_plane_mesh` makes of a file that was read."""
     types = sorted({block.type for block in source.cells})
-    found = [e for e, name in _MESHIO_NAME.items() if name in types]
+    found = [e for e, name in MESHIO_NAME.items() if name in types]
     if len(found) != 1:
-        known = list(_MESHIO_NAME.values())
+        known = list(MESHIO_NAME.values())
         raise InputError(f"expected one type of cells among {known} in {path}, got {types}")
-    name = _MESHIO_NAME[found[0]]
+    name = MESHIO_NAME[found[0]]
     cells = np.vstack([block.data for block in source.cells if block.type == name])
     return Mesh(source.points[:, :2], cells, found[0])

@@ -8,27 +8,30 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import gmsh
+import meshio
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from test_fem_simulate import PATIENT
 
-from modeharvest.fem.bloch.critical import first_critical
+from modeharvest.fem.bloch.critical import critical_at, first_critical
 from modeharvest.fem.bloch.postbuckling import follow
 from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.experiment import PathOptions
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import NODES_PER_CELL, Mesh
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize, ranked_branches
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
-from modeharvest.fem.lattice.micromorphic.mesh import rectangle_mesh
+from modeharvest.fem.lattice.micromorphic.mesh import quadrature, read_body_mesh, rectangle_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.path import HomogenizedPath
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern, snapped
 from modeharvest.fem.lattice.micromorphic.rve import RVE, centred_cell
 from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import Ogden, TwoTermI1
+from modeharvest.fem.meshing import quiet_gmsh
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.errors import InputError
 
@@ -219,6 +222,26 @@ def test_three_degenerate_modes_make_a_flower() -> None:
         assert ranked[at][1].negative_eigenvalues == negative
 
 
+def test_of_two_critical_modes_no_branch_is_followed_twice() -> None:
+    """Under uniaxial strain along x two of the three are critical: each, their sum, difference."""
+    lattice, material = hexagonal(1.9, 1.7, 0.5), Ogden()
+    modes = rve_modes(lattice, material)
+    element = RVE(lattice.enlarged(2, 2), material, modes, (0.0, 0.0))
+    body = HomogenizedBody(rectangle_mesh([0, 1], [0, 1]), element, HELD)
+    found = homogenize(body, [0.04], PathOptions(first_step=0.01, largest_step=0.01))
+    assert found.critical is not None
+    assert (len(found.critical.modes), found.critical.negative_after) == (2, 2)
+    assert [pattern for pattern, _ in found.ranked] == [(1, 0, 1), (1, 0, -1), (0, 0, 1), (1, 0, 0)]
+    assert found.states[0].energy == pytest.approx(found.ranked[0][1].energy, rel=1e-9)
+
+
+def rve_modes(lattice: UnitCell, material: Ogden) -> list[FloatArray]:
+    """At all three M points, of the lattice's first critical state under uniaxial strain."""
+    cell = PeriodicCell(lattice, material)
+    state = critical_at(CellPath(cell, uniaxial_strain()), (np.pi, np.pi)).state
+    return list(real_modes(cell, state, [(np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)]).shapes)
+
+
 def test_a_quarter_is_as_the_whole_on_the_primary_path() -> None:
     quarter, whole = (
         homogenize(
@@ -261,6 +284,49 @@ def test_a_plate_s_force_is_the_derivative_of_the_energy() -> None:
         slope = (above.energy - below.energy) / (2 * step)
         assert at.force * body.length == pytest.approx(slope, rel=1e-6)
         assert at.negative_eigenvalues == 0
+
+
+@pytest.mark.parametrize(
+    ("loading", "gradient"),
+    [
+        (PlateLoading(sides="clamped", pattern_at_plates="free"), ((-1, 0), (0, 0))),
+        (PlateLoading(sides="guided", lateral=1.0, pattern_at_plates="free"), ((-1, 0), (0, -1))),
+        (PlateLoading(1, 0.5, sides="periodic", pattern_at_plates="free"), ((-1, 0), (0.5, 0))),
+        (
+            PlateLoading(1, -0.5, lateral=0.3, sides="clamped", pattern_at_plates="free"),
+            ((-1, 0), (-0.5, -0.3)),
+        ),
+    ],
+)
+def test_plates_and_sides_make_the_strain_that_they_say(
+    loading: PlateLoading, gradient: tuple[tuple[float, float], tuple[float, float]]
+) -> None:
+    """A homogeneous strain, under which the lattice buckles where Bloch waves say."""
+    body = lattice_body(rve(), loading, holes=4)
+    path = HomogenizedPath(body)
+    assert path.follow_primary(0.02)
+    F = path.states[-1].strains[:, :4]
+    expected = np.eye(2).ravel() + 0.02 * np.ravel(gradient)
+    np.testing.assert_allclose(F, np.tile(expected, (4, 1)), atol=1e-12)
+    lattice = CellPath(PeriodicCell(square(PITCH, 1.5, 0.4), Ogden()), MacroLoading(gradient))
+    exact = critical_at(lattice, (np.pi, np.pi)).load
+    found = homogenize(body, [1.1 * exact])
+    assert found.critical is not None
+    assert found.critical.load == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_bent_beam_has_the_stiffness_of_the_rve_s_moduli() -> None:
+    """Energy E b e^2 L / 3 of a beam of height 2 b, e in its outermost fibre."""
+    load, element = 1e-3, rve()
+    bent = PlateLoading(0, 0, 1, plates="sliding")
+    body = lattice_body(element, bent, holes=6, parts=2)
+    path = HomogenizedPath(body)
+    assert path.follow_primary(load)
+    D = relaxed(element, element.at_rest, np.zeros(element.cell.reduction.size))[1]
+    modulus = D[0, 0] - D[0, 3] ** 2 / D[3, 3]
+    energy = modulus * PITCH * load**2 * body.length / 3
+    assert path.states[-1].energy == pytest.approx(energy, rel=1e-5)
+    assert path.states[-1].force * body.length == pytest.approx(2 * energy / load, rel=1e-5)
 
 
 def test_positions_of_the_rve_are_averaged() -> None:
@@ -348,6 +414,76 @@ def test_modes_that_will_not_do_are_refused() -> None:
         RVE(cell(), Ogden(), [PATTERN], normalisation="unit")
 
 
+ELEMENTS = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_a_mesh_of_any_element_is_read_and_buckles_as_the_lattice_does(
+    element: str, tmp_path: Path
+) -> None:
+    nodes = np.vstack([[9, 9], nine_nodes()[0]])  # one that no element has
+    cells = [[1, 2, 3, 4, 5, 6, 7, 8, 9]]
+    if element[0] == "T":
+        cells = [[1, 2, 3, 5, 6, 9], [1, 3, 4, 9, 7, 8]]
+    own = [cell[: NODES_PER_CELL[element]] for cell in cells]
+    meshio.Mesh(np.pad(nodes, ((0, 0), (0, 1))), {ELEMENTS[element]: own}).write(tmp_path / "m.vtu")
+    mesh, is_lattice, edges = read_body_mesh(tmp_path / "m.vtu")
+    assert (mesh.element, is_lattice.all(), edges) == (element, True, {})
+    assert quadrature(mesh, 2).weights.sum() == pytest.approx(12)
+    found = homogenize(HomogenizedBody(mesh, rve(), HELD), [0.06]).critical
+    assert found is not None
+    assert found.load == pytest.approx(bloch_critical(uniaxial_strain()), rel=1e-6)
+
+
+def nine_nodes() -> tuple[FloatArray, list[list[int]]]:
+    """One Q9 element."""
+    sides = [[0, 0], [4, 0], [4, 3], [0, 3], [2, 0], [4, 1.5], [2, 3], [0, 1.5], [2, 1.5]]
+    return np.array(sides, float), [list(range(9))]
+
+
+def two_rectangles(path: Path, is_joined: bool = True) -> Path:
+    """A lattice and a solid end, named; the plate on the right is the middle of its edge alone."""
+    with quiet_gmsh():
+        of = gmsh.model.occ
+        parts = [of.addRectangle(x, 0, 0, 2, 2) for x in (0, 2)]
+        if is_joined:
+            of.fragment([(2, parts[0])], [(2, parts[1])])
+        of.synchronize()
+        right = [tag for dim, tag in gmsh.model.getEntitiesInBoundingBox(3.9, -1, -1, 4.1, 3, 1, 1)]
+        for name, dim, tags in (
+            ("bulk", 2, parts[1:]),
+            ("holes", 2, parts[:1]),
+            ("right", 1, right),
+        ):
+            gmsh.model.addPhysicalGroup(dim, tags, name=name)
+        gmsh.option.setNumber("Mesh.MeshSizeMin", 1)
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 1)
+        gmsh.model.mesh.generate(2)
+        gmsh.model.mesh.setOrder(2)
+        gmsh.write(str(path))
+    return path
+
+
+def test_named_groups_of_a_mesh_are_bulk_and_plates(tmp_path: Path) -> None:
+    mesh, is_lattice, edges = read_body_mesh(two_rectangles(tmp_path / "two.msh"))
+    middles = mesh.nodes[mesh.cells[:, :3]].mean(axis=1)[:, 0]
+    np.testing.assert_array_equal(is_lattice, middles < 2)
+    assert list(edges) == ["right"]
+    np.testing.assert_allclose(mesh.nodes[edges["right"], 0], 4)
+    some = edges["right"][mesh.nodes[edges["right"], 1] > 0.5]
+    body = HomogenizedBody(
+        mesh, rve(), PlateLoading(), bulk=Ogden(), is_lattice=is_lattice, edges={"right": some}
+    )
+    path = HomogenizedPath(body)
+    assert path.follow_primary(0.01)
+    u = path.states[-1].displacement
+    np.testing.assert_allclose(u[some, 0], -0.5 * 0.01 * 4)
+    free = np.setdiff1d(edges["right"], some)
+    assert np.abs(u[free, 0] + 0.02).min() > 1e-4
+    with pytest.raises(InputError, match="one piece of material, got 2; merge"):
+        read_body_mesh(two_rectangles(tmp_path / "apart.msh", is_joined=False))
+
+
 def test_bodies_and_loadings_that_will_not_do_are_refused() -> None:
     square_one = rectangle_mesh([0, 1], [0, 1])
     nodes, cells = square_one.nodes, square_one.cells
@@ -357,12 +493,21 @@ def test_bodies_and_loadings_that_will_not_do_are_refused() -> None:
         HomogenizedBody(on_tips, rve(), LOOSE)
     with pytest.raises(InputError, match="positive Jacobians"):
         HomogenizedBody(inside_out, rve(), LOOSE)
+    two_points = HomogenizedBody(Mesh(*nine_nodes(), "Q9"), rve(), HELD, points=2)
+    with pytest.raises(InputError, match=r"stable without load.* take more points"):
+        HomogenizedPath(two_points)
     with pytest.raises(InputError, match="as many modes"):
         HomogenizedBody(square_one, [rve(), RVE(cell(), Ogden())], LOOSE)
     two = rectangle_mesh([0, 1, 2], [0, 1])
     with pytest.raises(InputError, match="material of the bulk"):
         HomogenizedBody(two, rve(), LOOSE, is_lattice=np.array([True, False]))
-    for bad in ({"sides": "held"}, {"compression": 0.0}, {"pattern_at_bulk": "one"}):
+    for bad in (
+        {"sides": "held"},
+        {"compression": 0.0},
+        {"pattern_at_bulk": "one"},
+        {"bending": 1.0, "sides": "periodic"},
+        {"lateral": 1.0},
+    ):
         with pytest.raises(InputError):
             PlateLoading(**bad)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="ascending"):

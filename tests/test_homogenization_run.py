@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,6 +17,8 @@ from numpy.typing import NDArray
 
 from modeharvest.cli.root import main
 from modeharvest.fem.lattice.micromorphic.patterns import rotation_pattern
+from modeharvest.fem.lattice.options import equibiaxial
+from modeharvest.fem.materials import Ogden
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.report.homogenization import homogenization_report
@@ -117,10 +121,12 @@ class Linear:
         (self.mode,) = Ansatz.of_specimen(self.specimen).modes
         self.start = self.mode.family.start
 
-    def snapped(self, parameters: FloatArray) -> LatticeMode:
-        return LatticeMode.of(self.mode, parameters, self.specimen, cell_vectors(self.specimen))
+    def snapped(self, parameters: FloatArray) -> tuple[LatticeMode]:
+        vectors = cell_vectors(self.specimen)
+        return (LatticeMode.of(self.mode, parameters, self.specimen, vectors),)
 
-    def response(self, mode: LatticeMode) -> Response:
+    def response(self, modes: Sequence[LatticeMode]) -> Response:
+        (mode,) = modes
         self.calls += 1
         sizes = np.hypot(mode.snapped.sine, mode.snapped.cosine)
         a1 = float(sizes[0, 0] / sizes[0, 1])
@@ -181,7 +187,28 @@ def test_a_pattern_and_its_mirror_image_are_one() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"experiment.specimen": {"stacking": "triangular"}}, "square stacking, got triangular"),
+        (
+            {"experiment.specimen": {"stacking": "rectangular", "pitch_y": 2.0}},
+            "square or triangular stacking, got rectangular",
+        ),
+        ({"experiment.specimen": {"diameter_y": 1.4}}, "round holes"),
+        (
+            {
+                "experiment.specimen": {"stacking": "triangular"},
+                "homogenization": {"quarter": True},
+            },
+            "quarter = false but for square stacking",
+        ),
+        ({"homogenization": {"quarter": True}, "loading": {"shear": 1.0}}, "quarter = false but"),
+        ({"mode": {"numbers": [2]}}, "numbers from 1 to 1 in square"),
+        (
+            {"experiment.specimen": {"stacking": "triangular"}, "mode": {"numbers": [1, 1]}},
+            "different numbers from 1 to 3",
+        ),
+        ({"loading": {"compression": 0.0}}, "one of them not 0"),
+        ({"loading": {"sides": "held"}}, "sides: expected one of"),
+        ({"loading": {"lateral": 1.0}}, "with lateral, got 'free'"),
+        ({"loading": {"sheer": 1.0}}, "did you mean 'shear'"),
         ({"homogenization": {"quarter": False}, "experiment": {"guided": True}}, "straight"),
         ({"experiment.specimen": {"grading_x": 0.001}}, "without grading, scatter and tilt"),
         ({"mode": {"strain": 0.2}}, "expected a strain among"),
@@ -195,6 +222,7 @@ def test_what_can_not_be_homogenized_is_refused(
     change: dict[str, dict[str, Any]], message: str, tmp_path: Path, capsys: Any
 ) -> None:
     lines = ["[homogenization]", "[mode]", "[experiment]", "[experiment.specimen]"]
+    lines += ["[loading]"] * ("loading" in change)
     for table, values in change.items():
         at = lines.index(f"[{table}]") + 1
         for key, value in values.items():
@@ -296,3 +324,155 @@ def test_computed_modes_are_alternatives(tmp_path: Path) -> None:
     assert 0.85 * analytic < bloch < analytic
     assert found[0]["effects"] == [] == found[1]["effects"]
     assert not (tmp_path / "bloch" / "experiment").exists(), "no images are needed"
+
+
+FLOWER = """
+title = "A flower"
+[homogenization]
+mesh_size = 0.5
+first_order = false
+pattern_at_plates = "free"
+divisions = [1, 1]
+[mode]
+kind = "bloch"
+[loading]
+lateral = 1.0
+sides = "periodic"
+loads = [0.025]
+[experiment]
+path = { first_step = 0.005, largest_step = 0.005 }
+[experiment.specimen]
+stacking = "triangular"
+holes_x = 2
+holes_y = 2
+diameter = 1.7
+bulk_x = 0.0
+bulk_y = 0.0
+"""
+
+
+@pytest.mark.dolfinx
+def test_of_three_modes_the_flower_wins(tmp_path: Path) -> None:
+    from modeharvest.fem.bloch.critical import critical_at
+    from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+    from modeharvest.fem.lattice.cells import hexagonal
+
+    found = {}
+    for kind in ("bloch", "analytic"):
+        case, out = case_of(tmp_path / "case.toml", FLOWER.replace("bloch", kind)), tmp_path / kind
+        found[kind] = HomogenizationRun(case, out).all()
+        assert "Branches of the critical point" in (out / "report.html").read_text("utf-8")
+        assert not (out / "experiment").exists(), "no direct simulation is of this load"
+    for summary in found.values():
+        branches = summary["branches"]
+        assert branches[0]["pattern"] == [1, 1, 1]
+        assert [sum(v != 0 for v in b["pattern"]) for b in branches] == 4 * [3] + 6 * [2] + 3 * [1]
+        assert [b["negative_eigenvalues"] for b in branches] == 4 * [0] + 6 * [1] + 3 * [2]
+        assert summary["states"][0]["energy_N"] == pytest.approx(branches[0]["energy"], rel=1e-8)
+        assert summary["direct"]["states"] == []
+        energies = [summary["branches"][k]["energy"] for k in range(13)]
+        exact_energies = [b["energy"] for b in found["bloch"]["branches"]]
+        np.testing.assert_allclose(energies, exact_energies, rtol=1e-9)
+    cell = PeriodicCell(hexagonal(1.9, 1.7, 0.5), Ogden())
+    exact = critical_at(CellPath(cell, equibiaxial()), (math.pi, math.pi)).load
+    critical = {kind: summary["critical_strain"] for kind, summary in found.items()}
+    assert critical["bloch"] == pytest.approx(exact, rel=1e-6)
+    # With v the same everywhere w makes good what a mode's waves leave out.
+    assert critical["analytic"] == pytest.approx(exact, rel=1e-6)
+
+
+BENT = """
+title = "A plate of one's own, bent"
+[homogenization]
+mesh = "plate.vtu"
+mesh_size = 0.5
+first_order = false
+[mode]
+kind = "analytic"
+[loading]
+compression = 0.5
+bending = 1.0
+plates = "sliding"
+loads = [0.01, 0.02]
+[experiment]
+"""
+
+
+def plate(path: Path, corners: list[list[float]]) -> None:
+    """Two T6 elements."""
+    nodes = np.array(corners)
+    a, b, c, d = nodes
+    middles = [(a + b) / 2, (b + c) / 2, (c + d) / 2, (d + a) / 2, (a + c) / 2]
+    cells = [[0, 1, 2, 4, 5, 8], [0, 2, 3, 8, 6, 7]]
+    points = np.pad(np.vstack([nodes, middles]), ((0, 0), (0, 1)))
+    meshio.Mesh(points, {"triangle6": cells}).write(path)
+
+
+@pytest.mark.dolfinx
+def test_a_mesh_of_one_s_own_is_bent(tmp_path: Path) -> None:
+    plate(tmp_path / "plate.vtu", [[0, 0], [8, 0], [8, 5], [0, 5]])
+    case, out = case_of(tmp_path / "case.toml", BENT), tmp_path / "out"
+    summary = HomogenizationRun(case, out).all()
+    assert summary["direct"] == {"critical_strain": None, "states": []}
+    assert [s["nominal_strain"] for s in summary["states"]] == [0.01, 0.02]
+    energies = [s["energy_N"] for s in summary["states"]]
+    assert energies[1] == pytest.approx(4 * energies[0], rel=0.1)
+    assert not (out / "experiment").exists()
+    # The stage knows its mesh: another one is another specimen.
+    plate(tmp_path / "plate.vtu", [[0, 0], [8, 0], [8, 6], [0, 6]])
+    larger = HomogenizationRun(case, out).homogenize()["response"]["states"]
+    assert larger[0]["energy_N"] > 1.1 * energies[0]
+
+
+@pytest.mark.dolfinx
+@pytest.mark.parametrize(
+    ("corners", "message"),
+    [
+        ([[0, 0], [4, -3], [8, 0], [4, 3]], "expected supports that leave no rigid motion"),
+        ([[0, 0], [0, 5], [8, 5], [8, 0]], "expected elements with positive Jacobians"),
+        ([], "plate.vtu, found no such file"),
+    ],
+)
+def test_a_mesh_that_will_not_do_is_refused_in_one_line(
+    corners: list[list[float]], message: str, tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    case = tmp_path / "case.toml"
+    case.write_text(BENT, "utf-8")
+    if corners:
+        plate(tmp_path / "plate.vtu", corners)
+    monkeypatch.setattr("sys.argv", ["modeharvest", "homogenize", str(case), "--out", "out"])
+    monkeypatch.chdir(tmp_path)
+    main_exit(2)
+    error = capsys.readouterr().err
+    assert message in " ".join(error.split())
+    assert "Traceback" not in error
+
+
+class Modes:
+    """A result with some modes."""
+
+    def __init__(self, ansatz: Ansatz) -> None:
+        self.ansatz = ansatz
+        self.unknowns = np.zeros(ansatz.size)
+
+
+@pytest.mark.dolfinx
+def test_three_measured_modes_are_snapped_each(tmp_path: Path) -> None:
+    """Their parameters a little off; of the third a wave lies between two of the lattice's."""
+    text = FLOWER.replace('"bloch"', '"measured"').replace("holes_x = 2", "holes_x = 7")
+    case = case_of(tmp_path / "case.toml", text.replace("holes_y = 2", "holes_y = 7"))
+    run = HomogenizationRun(case, tmp_path / "out")
+    ansatz = Ansatz.of_specimen(case.experiment.specimen)
+    object.__setattr__(run, "result", Modes(ansatz))
+    starts = [mode.family.start for mode in ansatz.modes]
+    off = np.concatenate(starts) + np.tile([0.01, 0.02, 0.03, -0.02, 0.05, -0.05], 3)
+    modes = run._modes_of(off)
+    assert [mode.wave_change.max() < 0.06 for mode in modes] == 3 * [True]
+    points = np.random.default_rng(0).uniform(-5, 5, (20, 2))
+    lattice = run._cell.lattice
+    for mode in modes:
+        there = mode.snapped(points + lattice[0] - 2 * lattice[1])
+        np.testing.assert_allclose(there, mode.snapped(points), atol=1e-9)
+    off[12:16] += [0.0, 0.0, 0.3, 0.0]
+    with pytest.raises(InputError, match=r"phi3: mode: expected wave vectors within 10%"):
+        run._modes_of(off)

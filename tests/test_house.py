@@ -26,7 +26,7 @@ HOMOGENIZATION = (
     "src/modeharvest/cli/homogenization.py",
     "src/modeharvest/report/homogenization.py", "src/modeharvest/report/figures/homogenization.py",
 )  # fmt: skip
-OWN_BOUNDS = {HOMOGENIZATION: (18, 3_080)}
+OWN_BOUNDS = {HOMOGENIZATION: (18, 3_480)}
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 
 PRIVATE_WORDS = """

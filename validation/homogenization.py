@@ -8,7 +8,7 @@ differences.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -144,7 +144,7 @@ def _central_hole(specimen: Specimen) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class ModeParameters:
-    """The parameters of a measured mode with their covariances, whose names they have."""
+    """The parameters of measured modes with their covariances, whose names they have."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -190,24 +190,24 @@ class ParameterEffect:
 def with_errors(
     response: Response,
     parameters: ModeParameters,
-    mode: Callable[[FloatArray], LatticeMode],
-    predicted: Callable[[LatticeMode], Response],
+    modes: Callable[[FloatArray], Sequence[LatticeMode]],
+    predicted: Callable[[Sequence[LatticeMode]], Response],
 ) -> tuple[Response, tuple[ParameterEffect, ...]]:
-    """Propagate the covariance of a mode's parameters to the response.
+    """Propagate the covariance of the modes' parameters to the response.
 
     response : with the parameters themselves.
-    mode : from parameters (m,), snapped.
-    predicted : the response with a mode; called once for each parameter that snapping leaves.
+    modes : from parameters (m,), snapped.
+    predicted : the response with modes; called once for each parameter that snapping leaves.
     """
-    m, here = len(parameters.values), mode(parameters.values)
+    m, here = len(parameters.values), modes(parameters.values)
     J, is_snapped = np.zeros((len(response.values), m)), np.zeros(m, bool)
     sds = [np.full(m, np.nan) if C is None else np.sqrt(np.diag(C))
            for C in (parameters.by_noise, parameters.by_model_error)]  # fmt: skip
     for k in range(m):
         step = np.zeros(m)
         step[k] = max(_LEAST_STEP, np.sqrt(parameters.covariance[k, k]))
-        there = mode(parameters.values + step)
-        is_snapped[k] = here.is_same(there)
+        there = modes(parameters.values + step)
+        is_snapped[k] = all(a.is_same(b) for a, b in zip(here, there, strict=True))
         if not is_snapped[k]:
             J[:, k] = (predicted(there).values_at(response) - response.values) / step[k]
     variances, count = np.einsum("ik,kl,il->i", J, parameters.covariance, J), len(response.states)

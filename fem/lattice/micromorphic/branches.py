@@ -29,6 +29,7 @@ from modeharvest.util.progress import Progress, silent
 _FARTHEST = 0.5  # of the pitch: the largest amplitude of a branch
 _SHORTEST = 0.02  # of the first amplitude: the smallest step
 _LIKE = 0.01  # overlap of a critical mode with a pattern below which there is none
+_ALIKE = 1e-6  # of 1: the cosine of directions that are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,9 @@ class Homogenized:
     """How far it was followed, and why no farther."""
     linearisations: int
     """Of the whole body: as many factorisations of every RVE."""
+    ranked: tuple[tuple[tuple[float, ...], HomogenizedState], ...] = ()
+    """All branches of a degenerate critical point at one load, that of least energy, which
+    ``states`` follow, first: the pattern each starts along, and its state."""
 
     @property
     def critical(self) -> HomogenizedCritical | None:
@@ -60,7 +64,8 @@ def homogenize(
     """States of a homogenized specimen at some loads [-], positive and ascending.
 
     On the primary path up to the first critical point at which a pattern grows, then on the branch
-    that it makes. Critical points of u alone, before it, are kept in ``criticals`` and passed.
+    that it makes; of several (``ranked_branches``, at the first load) on that of least energy.
+    Critical points of u alone, before it, are kept in ``criticals`` and passed.
     """
     wanted = np.asarray(loads, dtype=np.float64)
     if wanted.ndim != 1 or not len(wanted) or not (np.diff(wanted, prepend=0.0) > 0).all():
@@ -68,9 +73,12 @@ def homogenize(
     path, met = HomogenizedPath(body, options), list[HomogenizedState]()
     criticals: list[HomogenizedCritical] = []
     block, pending = "all", list(wanted)
+    ranked: list[tuple[tuple[float, ...], HomogenizedState]] = []
 
     def ended(outcome: str) -> Homogenized:
-        return Homogenized(tuple(met), tuple(criticals), outcome, path.linearisations)
+        return Homogenized(
+            tuple(met), tuple(criticals), outcome, path.linearisations, tuple(ranked)
+        )
 
     while pending:
         if not path.follow_primary(pending[0], block):
@@ -83,7 +91,10 @@ def homogenize(
                 return ended(f"the critical point below the load {here.load:.6g} got lost")
             criticals.append(found)
             if found.kind == "pattern":
-                states, outcome = follow_branch(path, found, pending, progress=progress)
+                if len(found.modes) > 1:
+                    ranked = ranked_branches(path, found, pending[0], progress)
+                pattern = ranked[0][0] if ranked else None
+                states, outcome = follow_branch(path, found, pending, pattern, progress)
                 met += states
                 return ended(outcome)
             block = "pattern" if found.kind == "displacement" else ""
@@ -110,7 +121,8 @@ def follow_branch(
     """
     if not len(critical.modes):
         raise InputError("branch: expected a critical point of the body, got one of an RVE")
-    mode = _combined(path, critical, pattern)
+    along = _combined(path, critical, pattern)
+    mode = critical.modes[0] if along is None else along
     weights = path.scale * mode / float(mode @ (path.scale * mode))
     start = _start(path, critical, mode)
     points, found, name = [start], list[HomogenizedState](), "buckled"
@@ -149,8 +161,8 @@ def follow_branch(
 
 def _combined(
     path: HomogenizedPath, critical: HomogenizedCritical, pattern: Sequence[float] | None
-) -> FloatArray:
-    """The combination of critical modes nearest to a pattern, of size 1 mm."""
+) -> FloatArray | None:
+    """The combination of critical modes nearest to a pattern, of size 1 mm; None if unlike all."""
     count = path.body.mode_count
     wanted = np.ones(count) if pattern is None else np.asarray(pattern, np.float64)
     if wanted.shape != (count,) or not np.any(wanted):
@@ -159,8 +171,9 @@ def _combined(
     modes = critical.modes
     overlaps = modes @ (path.scale * path.body.picked(like))
     mix = np.linalg.solve((modes * path.scale) @ modes.T, overlaps)
-    size = np.linalg.norm(mix)
-    mode = mix @ modes if size > _LIKE * np.linalg.norm(wanted) else modes[0]
+    if not np.linalg.norm(mix) > _LIKE * np.linalg.norm(wanted):
+        return None
+    mode = mix @ modes
     return np.asarray(mode / path.largest(mode)[critical.kind != "pattern"])
 
 
@@ -173,15 +186,25 @@ def _start(path: HomogenizedPath, critical: HomogenizedCritical, mode: FloatArra
 
 
 def ranked_branches(
-    path: HomogenizedPath, critical: HomogenizedCritical, load: float
+    path: HomogenizedPath, critical: HomogenizedCritical, load: float, progress: Progress = silent
 ) -> list[tuple[tuple[float, ...], HomogenizedState]]:
     """The branches of a critical point at a load, that of least energy first.
 
     Those along single modes v_i and along sums of them with either sign, the first one positive,
-    each with its pattern; those that can't be followed are left out.
+    each with its pattern. Left out are those that can't be followed, and patterns that the critical
+    modes don't tell apart.
     """
     signs = product((0.0, 1.0, -1.0), repeat=path.body.mode_count)
     patterns = [p for p in signs if next((x for x in p if x), 0.0) > 0]
-    found = [(p, follow_branch(path, critical, [load], p)[0]) for p in patterns]
-    met = [(pattern, states[0]) for pattern, states in found if states]
-    return sorted(met, key=lambda item: item[1].energy)
+    met, followed = list[tuple[tuple[float, ...], HomogenizedState]](), list[FloatArray]()
+    for k, pattern in enumerate(patterns, start=1):
+        mode = _combined(path, critical, pattern)
+        if mode is None:
+            continue
+        mode = mode * np.sqrt(path.scale) / np.sqrt(mode @ (path.scale * mode))
+        if any(abs(mode @ other) > 1.0 - _ALIKE for other in followed):
+            continue
+        followed.append(mode)
+        met += [(pattern, s) for s in follow_branch(path, critical, [load], pattern)[0]]
+        progress(k, len(patterns), "branches")
+    return sorted(met, key=lambda item: float(f"{item[1].energy:.9e}"))  # alike: as they come

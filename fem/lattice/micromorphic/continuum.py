@@ -11,7 +11,7 @@ are shared out over the ranks of a communicator; everything else every rank has.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.lattice.micromorphic.mesh import Quadrature, quadrature, specimen_mesh
+from modeharvest.fem.lattice.micromorphic.mesh import EDGES, Quadrature, quadrature, specimen_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.rve import RVE
 from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
@@ -52,7 +52,9 @@ class HomogenizedBody:
     rves : one, or several that are averaged at every point.
     length : L, which the load refers to [mm]; by default the distance of the plates.
     bulk, is_lattice : material of solid elements, and which (m,) are not solid; by default all.
-    points : Gauss points a direction.
+    points : Gauss points a direction; by default 2, of Q9, which 2 would leave loose, 3.
+    edges : nodes of plates and sides, by names among ``EDGES``; by default those of least and
+        largest x and y.
     """
 
     def __init__(
@@ -63,8 +65,9 @@ class HomogenizedBody:
         length: float | None = None,
         bulk: Material | None = None,
         is_lattice: BoolArray | None = None,
-        points: int = 2,
+        points: int | None = None,
         comm: MPI.Comm = MPI.COMM_WORLD,
+        edges: Mapping[str, IntArray] | None = None,
     ) -> None:
         self.mesh, self.loading, self.bulk, self.comm = mesh, loading, bulk, comm
         self.rves = (rves,) if isinstance(rves, RVE) else tuple(rves)
@@ -82,10 +85,11 @@ class HomogenizedBody:
         """How many such bodies make up the whole."""
         self.length = float(length or (high - low)[0] * math.sqrt(self.copies))
         self._lattice_nodes = np.unique(mesh.cells[lattice])
+        points = points or (3 if mesh.element == "Q9" else 2)
         self.regions = [self._region(lattice, points, self.mode_count)]
         if not lattice.all():
             self.regions.append(self._region(~lattice, points, 0))
-        self._constrain(low, high)
+        self._constrain(low, high, edges or {})
         self.point_count = self.regions[0].at.weights.size
         count = self.point_count * len(self.rves)
         if comm.size > count:
@@ -171,29 +175,33 @@ class HomogenizedBody:
         dofs = cells[..., None] * (2 + self.mode_count) + np.arange(2 + m)
         return _Region(at, B.reshape(c, p, -1, k * (2 + m)), dofs.reshape(c, -1))
 
-    def _constrain(self, low: FloatArray, high: FloatArray) -> None:
+    def _constrain(self, low: FloatArray, high: FloatArray, edges: Mapping[str, IntArray]) -> None:
         """Which unknowns are free, which follow another one, and how the load moves the rest."""
         nodes, loading, n = self.mesh.nodes, self.loading, len(self.mesh.nodes)
         near, half = 1e-6 * float((high - low).max()), 0.5 * (high - low)
-        (left, bottom), (right, top) = (near > np.abs(nodes - e).T for e in (low, high))
-        y, push, shear = nodes[:, 1] - low[1] - half[1], 0.5 * self.length, loading.shear
+        is_at = [near > np.abs(nodes - end)[:, axis] for end in (low, high) for axis in (0, 1)]
+        for k, name in enumerate(EDGES):
+            is_at[k] = np.isin(np.arange(n), edges[name]) if name in edges else is_at[k]
+        left, bottom, right, top = is_at
+        plates, sides = left | right, bottom | top
+        x, y = ((nodes - low) / half - 1.0).T
+        x = np.where(plates, 1.0 * right - left, x)
         held, direction = np.zeros((2, n, 2 + self.mode_count))
-        direction[:, 1] = -loading.lateral * y
         if loading.quarter:
             held[left, 0] = held[bottom, 1] = True
-            left = np.zeros(n, bool)
-        elif loading.plates == "sliding" and loading.sides != "guided":
+            plates, x = right, 0.5 * (x + 1.0)
+        elif loading.plates == "sliding" and loading.sides in ("free", "periodic"):
             edge = np.flatnonzero(left)
             held[edge[np.argmin(np.abs(y[edge]))], 1] = True
-        for sign, plate in ((1.0, left), (-1.0, right)):
-            along = loading.compression + loading.bending * y[plate] / half[1]
-            direction[plate, 0] = sign * push * along
-            held[plate, 0] = True
-            if loading.plates == "clamped":
-                direction[plate, 1] -= sign * push * shear
-                held[plate, 1] = True
-        held[(bottom | top) & (loading.sides == "guided"), 1] = True
-        held[(left | right) & (loading.pattern_at_plates == "zero"), 2:] = True
+        push = 0.5 * self.length * x
+        direction[:, 0] = -push * (loading.compression + loading.bending * y)
+        direction[:, 1] = push * loading.shear - loading.lateral * half[1] * y
+        held[plates, 0] = True
+        held[plates & (loading.plates == "clamped"), 1] = True
+        held[sides & (loading.sides in ("guided", "clamped")), 1] = True
+        if loading.sides == "clamped":
+            held[sides, 0], plates = True, plates | sides
+        held[plates & (loading.pattern_at_plates == "zero"), 2:] = True
         held[np.setdiff1d(np.arange(n), self._lattice_nodes), 2:] = True
         if loading.pattern_at_bulk == "zero":
             held[np.unique(self.mesh.cells[~self.is_lattice]), 2:] = True

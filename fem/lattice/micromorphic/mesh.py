@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import MESHIO_NAME, Mesh, plane_mesh, read_any_mesh
 from modeharvest.fem.specimen import Specimen
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.elements import reference_element, shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
+
+EDGES = ("left", "bottom", "right", "top")
+"""Plates are left and right, sides bottom and top."""
 
 # Of Gauss points on a triangle, for degrees 2 and 4: barycentric coordinate a of (a, a, 1 - 2 a).
 _TRIANGLE_RULES = {
@@ -101,3 +107,43 @@ def specimen_mesh(
     mesh = rectangle_mesh(*places)
     middles = mesh.nodes[mesh.cells[:, :4]].mean(axis=1)
     return mesh, np.all(np.abs(middles) < half, axis=1)
+
+
+class BodyMesh(NamedTuple):
+    """What a file says of a homogenized body."""
+
+    mesh: Mesh
+    is_lattice: BoolArray
+    """(m,) which elements aren't solid bulk."""
+    edges: Mapping[str, IntArray]
+    """Node numbers of those of ``EDGES`` that the file names."""
+
+
+def read_body_mesh(path: Path | str) -> BodyMesh:
+    """Read a macroscopic mesh [mm] of T3, T6, Q4, Q8 or Q9 from any file that meshio reads.
+
+    Sets of elements (physical groups of gmsh's format 4.1) named "bulk" are solid, those named as
+    ``EDGES`` plates and sides. An InputError refuses what can't be read, and pieces apart.
+    """
+    source = read_any_mesh(path)
+    whole = plane_mesh(source, path)
+    used, cells = np.unique(whole.cells, return_inverse=True)
+    cells, n = cells.reshape(whole.cells.shape), len(used)
+    pairs = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
+    pieces = connected_components(csr_array((np.ones(cells.size), pairs), (n, n)), False)[0]
+    if pieces != 1:
+        raise InputError(
+            f"{path}: expected one piece of material, got {pieces}; merge nodes that coincide"
+        )
+    edges = dict[str, IntArray]()
+    is_lattice: BoolArray = np.ones(len(cells), bool)
+    for name, parts in source.cell_sets.items():
+        chosen = [(b, np.asarray(k, int)) for b, k in zip(source.cells, parts, strict=True)]
+        if name in EDGES:
+            named = np.concatenate([block.data[k].ravel() for block, k in chosen])
+            edges[name] = np.searchsorted(used, np.intersect1d(named, used))
+        elif name == "bulk":
+            solid = [np.isin(np.arange(len(block.data)), k) for block, k in chosen
+                     if block.type == MESHIO_NAME[whole.element]]  # fmt: skip
+            is_lattice = ~np.concatenate(solid)
+    return BodyMesh(Mesh(whole.nodes[used], cells, whole.element), is_lattice, edges)

@@ -9,7 +9,7 @@ import numpy as np
 from modeharvest.fem.experiment import require_edges
 from modeharvest.util.errors import InputError
 
-SIDES = ("free", "periodic", "guided")
+SIDES = ("free", "periodic", "guided", "clamped")
 PATTERN = ("zero", "free")
 
 
@@ -31,11 +31,11 @@ class PlateLoading:
     """With "sliding", u_y is free on the plates but for one node, which keeps the body there."""
     sides: str = "free"
     """The edges of least and largest y: "free"; "periodic": v is alike on both, and u but for the
-    lateral strain; "guided": u_y = - e lateral y."""
+    lateral strain; "guided": u_y is linear between the plates; "clamped": u_x is, too."""
     pattern_at_plates: str = "zero"
     pattern_at_bulk: str = "zero"
-    """Whether v is 0 where the lattice meets a plate, and where it meets solid bulk, or "free":
-    Lambda . n = 0 there."""
+    """Whether v is 0 where the lattice meets a plate or a clamped side, and where it meets solid
+    bulk, or "free": Lambda . n = 0 there."""
     quarter: bool = False
     """Whether the body is the quarter x, y >= 0 of one that is its own mirror image: u symmetric,
     v even. Compression only. Instabilities of another symmetry, such as bowing, aren't seen."""
@@ -52,9 +52,9 @@ class PlateLoading:
         if self.sides not in SIDES:
             raise InputError(f"sides: expected one of {SIDES}, got {self.sides!r}")
         if self.bending and self.sides == "periodic":
-            raise InputError("sides: expected 'free' or 'guided' ones in bending, got 'periodic'")
+            raise InputError("sides: expected others in bending, got 'periodic'")
         if self.lateral and self.sides == "free":
-            raise InputError("sides: expected 'periodic' or 'guided' ones with lateral, got 'free'")
+            raise InputError("sides: expected others with lateral, got 'free'")
         for name in ("pattern_at_plates", "pattern_at_bulk"):
             if getattr(self, name) not in PATTERN:
                 raise InputError(f"{name}: expected one of {PATTERN}, got {getattr(self, name)!r}")

@@ -99,8 +99,11 @@ class HomogenizedPath:
         self.pitch = 0.5 * float(np.linalg.norm(vectors, axis=1).min())
         """Half the RVE's shorter vector, what a branch's amplitudes refer to [mm]."""
         start = self.equilibrium(0.0, body.start)
-        if start is None:
-            raise InputError("homogenized body: no equilibrium without load; check the material")
+        if start is None or start.negative_eigenvalues:
+            raise InputError(
+                "homogenized body: expected one that is stable without load, got one that isn't; "
+                "check material and mesh, or take more points"
+            )
         self.states = [start]
         """The primary path."""
         # A metric that makes eigenvalues of u and v comparable numbers.

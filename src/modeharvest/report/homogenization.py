@@ -35,6 +35,7 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
     report has numbers only, as for the terminal.
     """
     table = ReportTable.of("homogenized-states", map(_state_row, _pairs(summary)))
+    branches = ReportTable.of("homogenized-branches", map(_branch_row, summary["branches"]))
     return Report(
         kind="homogenization",
         title=summary["title"],
@@ -42,7 +43,8 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
         keys=key_numbers(summary),
         sections=[
             Section.of("homogenized-response", _response_cards(data)),
-            Section.of("homogenized-states", Card.tabular(table, wide=True)),
+            Section.of("homogenized-states",
+                       [*Card.tabular(table, wide=True), *Card.tabular(branches)]),
             Section.of("homogenized-amplitude", _amplitude_cards(data)),
             Section.of("homogenized-mode", _mode_cards(summary)),
         ],
@@ -87,6 +89,12 @@ def _state_row(pair: tuple[Mapping[str, Any], Mapping[str, Any] | None]) -> Mapp
     return row
 
 
+def _branch_row(branch: Mapping[str, Any]) -> Mapping[str, Any]:
+    return {"pattern": " ".join(f"{v:g}" for v in branch["pattern"]),
+            "strain": f"{100 * branch['load']:.4g}", "energy": f"{branch['energy']:.6g}",
+            "negative": branch["negative_eigenvalues"]}  # fmt: skip
+
+
 def findings(summary: Summary) -> list[str]:
     """What was found, in sentences."""
     text, critical, direct = [], summary["critical_strain"], summary["direct"]["critical_strain"]
@@ -100,6 +108,9 @@ def findings(summary: Summary) -> list[str]:
         if direct is not None:
             text.append(text_of("homogenized-direct", value=100 * direct,
                                 off=_off(critical, direct)))  # fmt: skip
+    if summary["branches"]:
+        row = _branch_row(summary["branches"][0])
+        text.append(text_of("homogenized-ranked", count=len(summary["branches"]), **row))
     first = summary["first_order_critical_strain"]
     if first is not None:
         off = _off(first, direct)
@@ -160,9 +171,11 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
     if data is None or not data.fields.states:
         return []
     state, mesh = data.compared or data.fields.states[-1], data.fields.mesh
-    v, fields = state.amplitudes[:, 0], {"homogenized": state.amplitudes[:, 0]}
+    several = state.amplitudes.shape[1] > 1
+    fields = {f"v{k} homogenized" if several else "homogenized": v
+              for k, v in enumerate(state.amplitudes.T, start=1)}  # fmt: skip
     if data.compared is not None:
-        v, measured = aligned(v, data.measured_at(mesh.nodes))
+        v, measured = aligned(state.amplitudes[:, 0], data.measured_at(mesh.nodes))
         fields = {"homogenized": v, "measured in the images": np.where(np.isnan(v), v, measured)}
     every = np.concatenate([values[np.isfinite(values)] for values in fields.values()])
     scale = ColourScale.signed(every, "mm")
@@ -181,7 +194,8 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
         for k, n in enumerate(dict.fromkeys(places), start=1)
     ]  # fmt: skip
     text = (text_of(f"homogenized-{name}") for name in ("fields", "microstructure"))
-    return [Card(f"Amplitude v₁ {at}", drawn, wide=True, caption=next(text)),
+    name = f"Amplitudes {at}" if several else f"Amplitude v₁ {at}"
+    return [Card(name, drawn, wide=True, caption=next(text)),
             Card(f"Microstructure {at}", rves, wide=True, caption=next(text))]  # fmt: skip
 
 

@@ -42,13 +42,14 @@ def _flattened(content: dict[str, Any], above: str = "") -> Iterable[tuple[str, 
 
 
 def read_mesh(path: str) -> Arrays:
-    """``points``, ``cells/N/TYPE`` and ``point_data/NAME`` of a mesh."""
+    """``points``, ``cells/N/TYPE``, ``cell_sets/N/NAME`` and ``point_data/NAME`` of a mesh."""
     import meshio
 
     mesh = meshio.read(path)
     cells = {f"cells/{k}/{block.type}": block.data for k, block in enumerate(mesh.cells)}
     fields = {f"point_data/{name}": values for name, values in mesh.point_data.items()}
-    return {"points": mesh.points, **cells, **fields}
+    sets = {f"cell_sets/{k}/{n}": s for n, v in mesh.cell_sets.items() for k, s in enumerate(v)}
+    return {"points": mesh.points, **cells, **fields, **sets}
 
 
 KINDS = {"mat": read_mat, "mesh": read_mesh}

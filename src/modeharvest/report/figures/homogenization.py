@@ -17,7 +17,7 @@ from modeharvest.report.figures.curves import curve, legend_above, ring
 from modeharvest.report.figures.maps import WIDTH, ColourScale, bare_axes, colour_bar
 from modeharvest.report.figures.style import BLUE, EDGE, GREEN, MUTED, RED, draw_path
 from modeharvest.util.arrays import FloatArray, IntArray
-from modeharvest.util.elements import shape_functions
+from modeharvest.util.elements import reference_element, shape_functions
 
 _FINE = 8
 """Parts of an element's side that are drawn."""
@@ -35,16 +35,17 @@ def draw_response(
 ) -> Figure:
     """Draw force or energy over nominal strain: direct simulation and homogenized states.
 
-    ``path``: ``Solution.info["path"]``, and its ``critical`` strain [-]; ``response``: the
-    homogenized one as plain values; ``first_order``: its critical strain without modes [-];
-    ``key``: of what is drawn, in a state.
+    ``path``: ``Solution.info["path"]``, empty without a direct simulation, and its ``critical``
+    strain [-]; ``response``: the homogenized one as plain values; ``first_order``: its critical
+    strain without modes [-]; ``key``: of what is drawn, in a state.
     """
     drawn, axes = curve("nominal strain [%]", label)
     of_path = {"force_N_per_mm": "reaction_N_per_mm", "energy_N": "energy_N"}[key]
-    primary = path["primary"]
-    first = primary["nominal_strain"], primary[of_path]
-    axes.plot(100 * np.array(first[0]), first[1], color=BLUE, lw=1.0, ls=":",
-              label="direct, primary path")  # fmt: skip
+    first: tuple[Any, Any] = (), ()
+    if path:
+        first = path["primary"]["nominal_strain"], path["primary"][of_path]
+        axes.plot(100 * np.array(first[0]), first[1], color=BLUE, lw=1.0, ls=":",
+                  label="direct, primary path")  # fmt: skip
     for branch in (path[name] for name in path if name != "primary"):
         strain, values = np.array(branch["nominal_strain"]), np.array(branch[of_path])
         if critical is not None:
@@ -115,23 +116,27 @@ def _deformed_axes(mesh: Mesh, displacement: FloatArray) -> tuple[Figure, Axes]:
 def _refined(
     mesh: Mesh, cells: IntArray, displacement: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Points (c p, 2) and triangles inside of Q8 elements, and their shape functions (p, k)."""
-    t = np.linspace(-1.0, 1.0, _FINE + 1)
-    xi = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
+    """Points (c p, 2) and triangles inside of elements, and their shape functions (p, k)."""
+    t = np.linspace(0.0, 1.0, _FINE + 1)
+    a, b = (places.ravel() for places in np.meshgrid(t, t, indexing="ij"))
+    is_triangle = reference_element(mesh.element).triangular
+    xi = np.stack([a, b * (1.0 - a)] if is_triangle else [2.0 * a - 1.0, 2.0 * b - 1.0], axis=1)
     N = shape_functions(mesh.element, xi)
     points = np.einsum("pk,cki->cpi", N, (mesh.nodes + displacement)[cells])
-    i, j = (a.ravel() for a in np.indices((_FINE, _FINE)))
-    a = i * (_FINE + 1) + j
-    b, c, d = a + _FINE + 1, a + _FINE + 2, a + 1
-    one = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    i, j = (index.ravel() for index in np.indices((_FINE, _FINE)))
+    k = i * (_FINE + 1) + j
+    right, corner, above = k + _FINE + 1, k + _FINE + 2, k + 1
+    one = np.concatenate([np.stack(s, axis=1) for s in ((k, right, corner), (k, corner, above))])
     every = one[None] + len(xi) * np.arange(len(cells))[:, None, None]
     return points.reshape(-1, 2), every.reshape(-1, 3), N
 
 
 def _draw_sides(axes: Axes, mesh: Mesh, displacement: FloatArray) -> None:
     """The sides of the elements, curved as they are."""
-    t = np.linspace(-1.0, 1.0, _FINE + 1)
-    one, at = np.ones_like(t), (mesh.nodes + displacement)[mesh.cells]
-    sides = [np.stack(side, axis=1) for side in ((t, -one), (one, t), (t, one), (-one, t))]
+    reference, t = reference_element(mesh.element), np.linspace(0.0, 1.0, _FINE + 1)[:, None]
+    corners = reference.nodes[: 3 if reference.triangular else 4]
+    at = (mesh.nodes + displacement)[mesh.cells]
+    ends = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    sides = [(1.0 - t) * start + t * end for start, end in ends]
     lines = [np.einsum("pk,cki->cpi", shape_functions(mesh.element, side), at) for side in sides]
     axes.add_collection(LineCollection(list(np.concatenate(lines)), colors=MUTED, lw=0.5, zorder=3))

@@ -5,6 +5,7 @@
     [homogenization]               # the RVE, the macroscopic elements, what holds the pattern
     [mode]
     kind = "measured"              # in the images of the experiment; or "analytic", "bloch", "file"
+    [loading]                      # optional: another one than the experiment's
     [experiment]                   # and [imaging], [correlation], as of a virtual experiment
 """
 
@@ -17,35 +18,45 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import model_validator
 
 from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.materials import MATERIALS
+from modeharvest.idic.modes import FAMILIES
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import Case, CaseModel, of_kind, with_kind
 from modeharvest.util.errors import InputError, require_within
-from modeharvest.util.typed import to_plain
+from modeharvest.util.typed import picked, to_plain
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Numbered:
+    """Modes that a specimen's stacking has: one if square, three if triangular."""
+
+    numbers: tuple[int, ...] = ()
+    """Which of them to use, from 1; by default all."""
 
 
 @dataclass(frozen=True)
-class MeasuredMode:
-    """The mode that the experiment's own images show."""
+class MeasuredMode(_Numbered):
+    """The modes that the experiment's own images show."""
 
     strain: float | None = None
     """Of the image [-]; by default the last one."""
 
 
 @dataclass(frozen=True)
-class AnalyticMode:
-    """The paper's Eq. (mode), exactly."""
+class AnalyticMode(_Numbered):
+    """The paper's Eq. (mode), exactly; in triangular stacking the start of a correlation."""
 
 
 @dataclass(frozen=True)
-class BlochMode:
-    """The critical mode of the infinite lattice under uniaxial stress along x."""
+class BlochMode(_Numbered):
+    """The infinite lattice's, at its critical point under the same kind of load."""
 
 
 @dataclass(frozen=True)
-class FileMode:
-    """A mode that was measured elsewhere: the result of a correlation or of a harvest."""
+class FileMode(_Numbered):
+    """Modes that were measured elsewhere: the result of a correlation or of a harvest."""
 
     path: str
     """A result as JSON, of a specimen whose middle is the origin; in a case file, relative to that
@@ -62,8 +73,9 @@ Mode = MeasuredMode | AnalyticMode | BlochMode | FileMode
 class HomogenizationOptions:
     """Choices of homogenization that matter; docs/homogenization.md says how much."""
 
-    centre: Literal["junction", "hole"] = "junction"
-    """About which the RVE of 2 x 2 cells is cut."""
+    centre: Literal["junction", "hole"] | None = None
+    """About which the RVE of 2 x 2 cells is cut; by default a junction in square stacking, in
+    triangular one a hole, about which its three modes are alike."""
     positions: int = 1
     """RVEs along x and y at each point, whose mean counts: centred there and a ``positions``-th of
     a cell apart."""
@@ -72,11 +84,15 @@ class HomogenizationOptions:
     pattern_at_plates: Literal["zero", "free"] = "zero"
     pattern_at_bulk: Literal["zero", "free"] = "zero"
     """The amplitudes v_i where the lattice meets solid strips along loaded and free edges."""
-    quarter: bool = True
+    quarter: bool | None = None
     """Whether only the quarter of the specimen is followed that its mirror images make whole: a
-    homogenized specimen may bow where the real one does not, see docs/homogenization.md."""
+    homogenized specimen may bow where the real one does not, see docs/homogenization.md. By default
+    where that can be: in square stacking and compression between free sides."""
     divisions: tuple[int, int] | None = None
     """Macroscopic elements of the lattice along x and y; by default as the cells ask for."""
+    mesh: str | None = None
+    """A macroscopic mesh of one's own [mm] instead of the specimen, as ``read_body_mesh`` takes it;
+    in a case file, relative to that file's folder."""
     first_order: bool = True
     """Whether to find the critical strain without modes, too."""
     error_bars: bool = True
@@ -90,6 +106,23 @@ class HomogenizationOptions:
             require_within(f"{what} divisions", number, 1, 1000)
 
 
+@dataclass(frozen=True)
+class SpecimenLoading:
+    """What a homogenized specimen is put under where that isn't the experiment's compression.
+
+    As in ``fem.lattice.micromorphic.options.PlateLoading``; the load e multiplies all rates.
+    """
+
+    compression: float = 1.0
+    shear: float = 0.0
+    bending: float = 0.0
+    lateral: float = 0.0
+    sides: str = "free"
+    plates: str = "clamped"
+    loads: tuple[float, ...] = ()
+    """e of the states to keep, ascending [-]; by default the experiment's strains."""
+
+
 class HomogenizationCase(CaseModel):
     """A virtual experiment, and how its specimen is homogenized."""
 
@@ -97,6 +130,7 @@ class HomogenizationCase(CaseModel):
 
     homogenization: HomogenizationOptions = HomogenizationOptions()
     mode: Annotated[Mode, of_kind(MODES, "mode")] = MeasuredMode()
+    loading: SpecimenLoading | None = None
     experiment: Annotated[Experiment, of_kind(MATERIALS, "experiment.material", "material")] = (
         Experiment()
     )
@@ -114,15 +148,48 @@ class HomogenizationCase(CaseModel):
     @classmethod
     def read(cls, name: str | Path) -> Self:
         """Read a case as every other; a mode's file is found beside the case's."""
-        case = super().read(name)
-        if not isinstance(case.mode, FileMode):
-            return case
-        file = str(Path(name).parent / case.mode.path)
-        return case.model_copy(update={"mode": replace(case.mode, path=file)})
+        case, folder, beside = super().read(name), Path(name).parent, dict[str, Any]()
+        if isinstance(case.mode, FileMode):
+            beside["mode"] = replace(case.mode, path=str(folder / case.mode.path))
+        if (mesh := case.homogenization.mesh) is not None:
+            beside["homogenization"] = replace(case.homogenization, mesh=str(folder / mesh))
+        return case.model_copy(update=beside)
+
+    @property
+    def is_experiment(self) -> bool:
+        """Whether the direct simulation is of the same specimen under the same load."""
+        return self.loading is None and self.homogenization.mesh is None
+
+    @property
+    def quarter(self) -> bool:
+        """Whether a quarter is followed."""
+        can = self.experiment.specimen.stacking == "square" and self.is_experiment
+        return can if self.homogenization.quarter is None else self.homogenization.quarter
+
+    @property
+    def centre(self) -> str:
+        """About which the RVE is cut."""
+        is_square = self.experiment.specimen.stacking == "square"
+        return self.homogenization.centre or ("junction" if is_square else "hole")
+
+    @property
+    def loads(self) -> tuple[float, ...]:
+        """Of the states to keep [-]."""
+        return (self.loading and self.loading.loads) or self.experiment.strains
+
+    @property
+    def plates(self) -> PlateLoading:
+        """How the homogenized specimen is held and loaded."""
+        load = self.loading or SpecimenLoading(plates=self.experiment.edges)
+        how = picked(self.homogenization, "pattern_at_plates pattern_at_bulk")
+        rates = picked(load, "compression shear bending lateral plates sides")
+        return PlateLoading(**rates, **how, quarter=self.quarter)
 
     def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values."""
-        own = {"title": self.title, "homogenization": to_plain(self.homogenization)}
+        """The case as plain JSON values, with what choices come to."""
+        chosen = {"centre": self.centre, "quarter": self.quarter}
+        own = {"title": self.title, "homogenization": to_plain(self.homogenization) | chosen,
+               "loading": to_plain(self.loading)}  # fmt: skip
         virtual = self.virtual.plain()
         tables = {name: virtual[name] for name in ("experiment", "imaging", "correlation")}
         return {**own, "mode": with_kind(self.mode, MODES), **tables}
@@ -130,17 +197,22 @@ class HomogenizationCase(CaseModel):
     @model_validator(mode="after")
     def _can_be_homogenized(self) -> Self:
         experiment, specimen = self.experiment, self.experiment.specimen
-        if specimen.stacking != "square" or specimen.diameter_y is not None:
+        if specimen.stacking == "rectangular" or specimen.diameter_y is not None:
             raise InputError(
-                "homogenization: expected round holes in square stacking, got "
+                "homogenization: expected round holes in square or triangular stacking, got "
                 f"{specimen.stacking} stacking, diameter_y = {specimen.diameter_y}"
+            )
+        if self.quarter and not (specimen.stacking == "square" and self.is_experiment):
+            raise InputError(
+                "homogenization: expected quarter = false but for square stacking and the "
+                "experiment's own load and shape, got true"
             )
         if specimen.grading_x or specimen.grading_y or not experiment.is_perfect:
             raise InputError(
                 "homogenization: expected a specimen without grading, scatter and tilt: one RVE "
                 "stands for all of it"
             )
-        if experiment.guided and not self.homogenization.quarter:
+        if experiment.guided and self.is_experiment and not self.quarter:
             raise InputError(
                 "homogenization: expected quarter = true for a guided specimen, whose middle line "
                 "stays straight, got false"
@@ -150,4 +222,11 @@ class HomogenizationCase(CaseModel):
         strain = getattr(self.mode, "strain", None)
         if strain is not None and strain not in experiment.strains:
             raise InputError(f"mode: expected a strain among {experiment.strains}, got {strain}")
+        count, numbers = len(FAMILIES[specimen.stacking](specimen)), self.mode.numbers
+        if len(set(numbers)) < len(numbers) or not set(numbers) <= set(range(1, count + 1)):
+            raise InputError(
+                f"mode: expected different numbers from 1 to {count} in {specimen.stacking} "
+                f"stacking, got {numbers}"
+            )
+        _ = self.plates  # or an InputError
         return self

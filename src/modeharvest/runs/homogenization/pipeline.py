@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.patterns import ModeField, PlaneWaves, rotation_pattern
-from modeharvest.fem.lattice.options import uniaxial
+from modeharvest.fem.lattice.options import MacroLoading
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.modes import FAMILIES
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.uncertainty.covariance import Covariance, covariance
@@ -64,6 +65,10 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
 
 _CRITICAL = "load kind negative_before negative_after"
+_WAVES = {"square": [(np.pi, np.pi)], "triangular": [(np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)]}
+"""Of the modes by stacking, in the order of ``FAMILIES``: phases along a1 and a2 [rad]."""
+
+FoundModes = tuple[tuple[LatticeMode, ...], ModeParameters | None, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -82,45 +87,52 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         """The virtual experiment."""
         return Run(self.case.virtual, self.folder / "experiment", self.progress)
 
-    def mode(self) -> tuple[LatticeMode | None, ModeParameters | None, tuple[str, ...]]:
-        """The mode, the parameters it was measured with, and warnings; leaves ``mode.json``.
+    def mode(self) -> FoundModes:
+        """The modes, the parameters they were measured with, and warnings; leaves ``mode.json``.
 
-        None for a mode that is computed, and for parameters of one that is not measured.
+        No modes where they are computed, and no parameters where they are not measured.
         """
         path = self.folder / "mode.json"
 
         def work() -> tuple[Path, ...]:
-            names = "mode", "parameters", "warnings"
-            write_json(path, to_plain(dict(zip(names, self._found_mode(), strict=True))))
+            names = "modes", "parameters", "warnings"
+            write_json(path, to_plain(dict(zip(names, self._found_modes(), strict=True))))
             return (path,)
 
         self.do("mode", self._mode_key, work)
         with reading(path, "a mode", "remove it"):
             content = read_json(path)
-            mode, parameters = content["mode"], content["parameters"]
-            found = mode and LatticeMode(*(PlaneWaves(**mode[k]) for k in ("measured", "snapped")))
-            known = parameters and ModeParameters.of(parameters)
-            return found, known, tuple(content["warnings"])
+            parts = "measured", "snapped"
+            found = [LatticeMode(*(PlaneWaves(**m[k]) for k in parts)) for m in content["modes"]]
+            known = content["parameters"] and ModeParameters.of(content["parameters"])
+            return tuple(found), known, tuple(content["warnings"])
 
     def homogenize(self) -> dict[str, Any]:
         """Follow the homogenized specimen; leaves ``homogenized.json`` and ``.h5``."""
         path, fields = self.folder / "homogenized.json", self.folder / "homogenized.h5"
-        mode, parameters, _ = self.mode()
+        modes, parameters, _ = self.mode()
         how = self.case.homogenization
 
         def work() -> tuple[Path, ...]:
-            body = self._body(self._modes(mode))
+            body = self._body(self._fields(modes))
             found = self._followed(body, "homogenized specimen")
             response, effects = response_of(found), tuple[ParameterEffect, ...]()
             if parameters is not None and how.error_bars:
                 response, effects = with_errors(
-                    response, parameters, self._mode_of, partial(self._predicted, what="error bars")
+                    response,
+                    parameters,
+                    self._modes_of,
+                    partial(self._predicted, what="error bars"),
                 )
             first = self._followed(self._body([]), "first order") if how.first_order else None
             write_json(path, to_plain({
                 "response": response,
                 "effects": effects,
                 "criticals": [picked(c, _CRITICAL) for c in found.criticals],
+                "branches": [
+                    {"pattern": pattern, **picked(s, "load energy negative_eigenvalues")}
+                    for pattern, s in found.ranked
+                ],
                 "first_order_critical_strain": first and first.critical and first.critical.load,
                 "rves": body.point_count * len(body.rves),
                 "linearisations": found.linearisations,
@@ -175,17 +187,24 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
     @cached_property
     def _homogenized_key(self) -> str:
         plain = self.case.plain()
-        return stage_key([self._mode_key, plain["experiment"], plain["homogenization"]])
+        own = [plain[name] for name in ("experiment", "homogenization", "loading")]
+        mesh = self.case.homogenization.mesh
+        return stage_key([self._mode_key, *own, mesh and sha256_of(mesh)])
 
     @cached_property
     def _cell(self) -> UnitCell:
         """The RVE's mesh: 2 x 2 cells, a hole's centre at the origin."""
+        return self._primitive.enlarged(2, 2)
+
+    @cached_property
+    def _primitive(self) -> UnitCell:
+        """One cell of the specimen's lattice, a hole's centre at the origin."""
         with requiring_dolfinx("homogenization needs"):
-            from modeharvest.fem.lattice.cells import square
+            from modeharvest.fem.lattice.cells import hexagonal, square
 
             specimen = self.case.experiment.specimen
-            size = self.case.homogenization.mesh_size
-            return square(specimen.pitch, specimen.diameter, size).enlarged(2, 2)
+            of = hexagonal if specimen.is_staggered else square
+            return of(specimen.pitch, specimen.diameter, self.case.homogenization.mesh_size)
 
     @cached_property
     def result(self) -> Result | None:
@@ -203,30 +222,56 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         strains, strain = self.case.experiment.strains, getattr(self.case.mode, "strain", None)
         return strains[-1] if strain is None else float(strain)
 
-    def _mode_of(self, parameters: FloatArray) -> LatticeMode:
-        assert self.result is not None
-        first = self.result.ansatz.modes[0]
-        return LatticeMode.of(first, parameters, self.case.experiment.specimen, self._cell.lattice)
+    @property
+    def _numbers(self) -> tuple[int, ...]:
+        """Of the modes to use, from 0."""
+        specimen = self.case.experiment.specimen
+        every = range(len(FAMILIES[specimen.stacking](specimen)))
+        return tuple(k - 1 for k in self.case.mode.numbers) or tuple(every)
 
-    def _found_mode(self) -> tuple[LatticeMode | None, ModeParameters | None, tuple[str, ...]]:
+    def _modes_of(self, parameters: FloatArray) -> tuple[LatticeMode, ...]:
+        """The measured modes that are used, of all their parameters in a row."""
+        assert self.result is not None
+        modes, given = self.result.ansatz.modes, list(parameters)
+        specimen, found = self.case.experiment.specimen, list[LatticeMode]()
+        for k in self._numbers:
+            own = [given.pop(0) for _ in range(modes[k].family.size)]
+            try:
+                found.append(LatticeMode.of(modes[k], own, specimen, self._cell.lattice))
+            except InputError as error:
+                raise InputError(f"phi{k + 1}: {error}") from error
+        return tuple(found)
+
+    def _found_modes(self) -> FoundModes:
         result, specimen = self.result, self.case.experiment.specimen
-        if isinstance(self.case.mode, AnalyticMode):
+        if isinstance(self.case.mode, AnalyticMode) and not specimen.is_staggered:
             ideal = rotation_pattern(specimen.pitch)
-            return LatticeMode(ideal, ideal), None, ()
+            return (LatticeMode(ideal, ideal),), None, ()
+        if isinstance(self.case.mode, AnalyticMode):
+            ideal_modes, vectors = Ansatz.of_specimen(specimen).modes, self._cell.lattice
+            ideals = [(ideal_modes[k], ideal_modes[k].family.start) for k in self._numbers]
+            return tuple(LatticeMode.of(*s, specimen, vectors) for s in ideals), None, ()
         if result is None:
-            return None, None, ()
-        if not result.ansatz.modes or not result.ansatz.modes[0].family.size:
-            raise InputError("mode: expected a result with a free mode, got one without")
+            return (), None, ()
+        modes, numbers = result.ansatz.modes, self._numbers
+        if len(modes) <= max(numbers) or not all(modes[k].family.size for k in numbers):
+            free = sum(mode.family.size > 0 for mode in modes)
+            raise InputError(
+                f"mode: expected a result with {max(numbers) + 1} free mode(s), as "
+                f"{specimen.stacking} stacking has, got {free} of {len(modes)}"
+            )
         pair = self._pair
+        parameters = self._parameters(result, pair)
         seen = identifiability(result, None if pair is None else pair.mask)
         try:
-            mode = self._mode_of(result.mode_parameters())
+            found = self._modes_of(parameters.values)
         except InputError as error:
-            if 0 not in seen.unobservable:
+            lost = [k for k, at in enumerate(seen.unobservable) if at in numbers]
+            if not lost:
                 raise
             raise InputError(f"mode: expected an image of the buckled specimen, got one in which "
-                             f"{seen.warnings[0]}") from error  # fmt: skip
-        return mode, self._parameters(result, pair), seen.warnings
+                             f"{seen.warnings[lost[0]]}; {error}") from error  # fmt: skip
+        return found, parameters, seen.warnings
 
     @property
     def _pair(self) -> ImagePair | None:
@@ -238,73 +283,89 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     def _parameters(self, result: Result, pair: ImagePair | None) -> ModeParameters:
         """With the covariances that the result, and its images where they are there, have."""
-        family, part = result.ansatz.modes[0].family, result.ansatz.phi_slice(0)
-        values, known = result.mode_parameters(), Covariance(result.covariance(), None)
+        known, ansatz = Covariance(result.covariance(), None), result.ansatz
         if pair is not None:
             noise, pitch = ImageNoise.of(result.noise_sd), self.case.experiment.specimen.pitch
             known = covariance(result, pair, noise, pitch, self.case.correlation.edge_px)
-        both = (C if C is None else C[part, part] for C in (known.by_noise, known.by_model_error))
-        return ModeParameters(family.names, family.units, values, *both)  # type: ignore[arg-type]
+        families = [ansatz.modes[k].family for k in self._numbers]
+        at = np.concatenate([np.arange(result.unknowns.size)[ansatz.phi_slice(k)]
+                             for k in self._numbers])  # fmt: skip
+        both = (
+            C if C is None else C[np.ix_(at, at)] for C in (known.by_noise, known.by_model_error)
+        )
+        names = [
+            f"phi{k + 1}.{name}" if len(families) > 1 else name
+            for k, family in zip(self._numbers, families, strict=True)
+            for name in family.names
+        ]
+        units = [unit for family in families for unit in family.units]
+        return ModeParameters(tuple(names), tuple(units), result.unknowns[at], *both)  # type: ignore[arg-type]
 
-    def _modes(self, mode: LatticeMode | None) -> list[ModeField]:
-        """phi in the RVE's coordinates; one that is not given is computed."""
-        if mode is not None:
-            return [mode.snapped]
+    def _fields(self, modes: Sequence[LatticeMode]) -> list[ModeField]:
+        """phi in the RVE's coordinates; those that are not given are computed."""
+        if modes:
+            return [mode.snapped for mode in modes]
         from modeharvest.fem.bloch.critical import critical_at
         from modeharvest.fem.bloch.real_modes import real_modes
         from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
-        from modeharvest.fem.lattice.cells import square
 
-        experiment, size = self.case.experiment, self.case.homogenization.mesh_size
-        specimen, loading = experiment.specimen, uniaxial(0)
-        unit = square(specimen.pitch, specimen.diameter, size)
-        cell = PeriodicCell(unit, experiment.material)
-        critical = critical_at(CellPath(cell, loading), (np.pi, np.pi))
-        return list(real_modes(cell, critical.state, [(np.pi, np.pi)]).shapes)
+        cell, path = PeriodicCell(self._primitive, self.case.experiment.material), self.case.plates
+        side = None if path.sides == "free" else -path.lateral
+        pushed = -path.compression - abs(path.bending)
+        lattice = CellPath(cell, MacroLoading(((pushed, 0.0), (path.shear, side))))
+        waves = _WAVES[self.case.experiment.specimen.stacking]
+        found = [c for c in (critical_at(lattice, wave) for wave in waves) if c.found]
+        if not found:
+            raise InputError("mode: expected a lattice that buckles under the load, got one that "
+                             "does not; take another kind of mode or another load")  # fmt: skip
+        state = min(found, key=lambda c: c.load).state
+        return list(real_modes(cell, state, [waves[k] for k in self._numbers]).shapes)
 
     def _body(self, modes: Sequence[ModeField]) -> HomogenizedBody:
         """The macroscopic finite elements with their RVEs."""
         experiment, how, cell = self.case.experiment, self.case.homogenization, self._cell
         from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
+        from modeharvest.fem.lattice.micromorphic.mesh import read_body_mesh
         from modeharvest.fem.lattice.micromorphic.rve import RVE
 
-        pitch, n = experiment.specimen.pitch, how.positions
-        middle = 0.5 * pitch if how.centre == "junction" else 0.0
-        places = middle + pitch * (np.arange(n) + 0.5 - 0.5 * n) / n
-        rves = [
-            RVE(cell, experiment.material, modes, centre, normalisation="given")
-            for centre in product(places, places)
-        ]
-        loading = PlateLoading(
-            plates=experiment.edges, quarter=how.quarter,
-            pattern_at_plates=how.pattern_at_plates, pattern_at_bulk=how.pattern_at_bulk,
-        )  # fmt: skip
-        return HomogenizedBody.of_specimen(
-            experiment.specimen, rves, loading, divisions=how.divisions
+        specimen, half, n = experiment.specimen, 0.5 * experiment.specimen.pitch, how.positions
+        junction = half, half / np.sqrt(3.0) if specimen.is_staggered else half
+        middle = junction if self.case.centre == "junction" else (0.0, 0.0)
+        steps = (np.arange(n) + 0.5 - 0.5 * n) / n
+        centres = middle + np.array(list(product(steps, steps))) @ specimen.vectors
+        rves = [RVE(cell, experiment.material, modes, c, normalisation="given") for c in centres]
+        plates = self.case.plates
+        if how.mesh is None:
+            return HomogenizedBody.of_specimen(specimen, rves, plates, divisions=how.divisions)
+        mesh, is_lattice, edges = read_body_mesh(how.mesh)
+        return HomogenizedBody(
+            mesh, rves, plates, bulk=experiment.material, is_lattice=is_lattice, edges=edges
         )
 
     def _followed(self, body: HomogenizedBody, what: str) -> Homogenized:
         from modeharvest.fem.lattice.micromorphic.branches import homogenize
 
         experiment, progress = self.case.experiment, named(self.progress, what)
-        return homogenize(body, experiment.strains, experiment.path, progress)
+        return homogenize(body, self.case.loads, experiment.path, progress)
 
-    def _predicted(self, mode: LatticeMode, what: str) -> Response:
-        return response_of(self._followed(self._body([mode.snapped]), what))
+    def _predicted(self, modes: Sequence[LatticeMode], what: str) -> Response:
+        return response_of(self._followed(self._body([mode.snapped for mode in modes]), what))
 
     def _data(self) -> HomogenizationData:
         """All that the report shows."""
-        found, (mode, parameters, warnings) = self.homogenize(), self.mode()
+        found, (modes, parameters, warnings) = self.homogenize(), self.mode()
         fields = HomogenizedFields.read(self.folder / "homogenized.h5")
+        solution = self.virtual.fem() if self.case.is_experiment else None
+        is_compared = isinstance(self.case.mode, MeasuredMode) and len(modes) == 1 and solution
         return HomogenizationData(
             found=found,
-            direct=direct_response(solution := self.virtual.fem()),
-            path=solution.info["path"],
-            mode=mode,
+            direct=Response(None, ()) if solution is None else direct_response(solution),
+            path={} if solution is None else solution.info["path"],
+            modes=modes,
             parameters=parameters,
             warnings=warnings,
             fields=fields,
-            measured=self.result if isinstance(self.case.mode, MeasuredMode) else None,
+            measured=self.result if is_compared else None,
             measured_strain=self._measured_strain,
             command=f"modeharvest homogenize {self.source} --out {self.folder}",
         )

@@ -125,10 +125,10 @@ class HomogenizationData:
     found: Mapping[str, Any]
     """The content of ``homogenized.json``."""
     direct: Response
-    """Of the direct simulation."""
+    """Of the direct simulation; without states where it is of another specimen or load."""
     path: Mapping[str, Any]
     """``Solution.info["path"]`` of it."""
-    mode: LatticeMode | None
+    modes: tuple[LatticeMode, ...]
     parameters: ModeParameters | None
     """None where they were not given, or not measured."""
     warnings: tuple[str, ...]
@@ -155,7 +155,7 @@ class HomogenizationData:
 def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) -> dict[str, Any]:
     """The content of ``summary.json``."""
     found, response = data.found, data.found["response"]
-    mode = data.mode
+    modes = data.modes
     return {
         "title": title,
         "case": dict(case),
@@ -163,14 +163,17 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
         "critical_strain": response["critical_strain"],
         "critical_strain_sd": response["critical_strain_sd"],
         "criticals": found["criticals"],
+        "branches": found["branches"],
         "first_order_critical_strain": found["first_order_critical_strain"],
         "states": response["states"],
         "direct": to_plain({"critical_strain": data.direct.critical_strain,
                             "states": data.direct.states}),
-        "mode": mode and to_plain({
-            "kind": case["mode"]["kind"], "wave_change": mode.wave_change, "waves": mode.snapped,
+        "mode": to_plain({
+            "kind": case["mode"]["kind"],
+            "wave_change": [change for mode in modes for change in mode.wave_change],
+            "waves": [mode.snapped for mode in modes],
             "errors": _errors(data.parameters),
-        }),
+        }) if modes else None,
         "sensitivities": found["effects"],
         "amplitude": _amplitude(data),
         "warnings": list(data.warnings),
@@ -179,8 +182,8 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
         "files": {
             "homogenized.h5": "mesh and states: u, v_i, generalised strains, stresses, RVEs (HDF5)",
             "homogenized.json": "critical strain, forces, energies, sensitivities",
-            "mode.json": "the mode as it was measured and snapped, with its covariances",
-            "experiment/": "the direct simulation, the images, and what was measured in them",
+            "mode.json": "the modes as they were measured and snapped, with their covariances",
+            "experiment/": "the virtual experiment: simulation, images, what was measured in them",
         },
         "versions": versions(),
     }  # fmt: skip
