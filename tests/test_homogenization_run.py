@@ -476,3 +476,33 @@ def test_three_measured_modes_are_snapped_each(tmp_path: Path) -> None:
     off[12:16] += [0.0, 0.0, 0.3, 0.0]
     with pytest.raises(InputError, match=r"phi3: mode: expected wave vectors within 10%"):
         run._modes_of(off)
+
+
+@pytest.mark.dolfinx
+def test_modes_of_a_cell_come_with_it(tmp_path: Path) -> None:
+    """As ``modeharvest modes`` leaves them; what belongs to another cell is refused."""
+    from modeharvest.fem.bloch.critical import critical_at
+    from modeharvest.fem.bloch.modes import write_modes
+    from modeharvest.fem.bloch.real_modes import real_modes
+    from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+    from modeharvest.fem.lattice.cells import square
+
+    cell = PeriodicCell(square(1.9, 1.7, 0.5), Ogden())
+    found = critical_at(CellPath(cell, equibiaxial()), (math.pi, math.pi))
+    write_modes(tmp_path / "modes.h5", real_modes(cell, found.state, [(math.pi, math.pi)]))
+    text = FLOWER.replace('stacking = "triangular"', "").replace(
+        '"bloch"', '"file"\npath = "modes.h5"'
+    )
+    text = text.replace("divisions", "centre = [0.95, 0.95]\ndivisions")
+    run = HomogenizationRun(case_of(tmp_path / "case.toml", text), tmp_path / "out")
+    summary = run.all()
+    assert summary["critical_strain"] == pytest.approx(found.load, rel=1e-6)
+    assert summary["case"]["homogenization"]["centre"] == [0.95, 0.95]
+    for change, message in (
+        (("diameter = 1.7", "diameter = 1.6"), r"modes of the specimen's lattice, solid to 44.3%"),
+        (("diameter = 1.7", "diameter = 1.7\npitch = 2.0"), r"cell with vectors \[\[1.9, 0.0\]"),
+        (('path = "modes.h5"', 'path = "modes.h5"\nnumbers = [2]'), "expected 2 modes, got 1"),
+    ):
+        other = case_of(tmp_path / "other.toml", text.replace(*change))
+        with pytest.raises(InputError, match=message):
+            HomogenizationRun(other, tmp_path / "other").all()

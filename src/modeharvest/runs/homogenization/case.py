@@ -56,11 +56,16 @@ class BlochMode(_Numbered):
 
 @dataclass(frozen=True)
 class FileMode(_Numbered):
-    """Modes that were measured elsewhere: the result of a correlation or of a harvest."""
+    """Modes found elsewhere: measured, or computed on any cell by ``modeharvest modes``."""
 
     path: str
-    """A result as JSON, of a specimen whose middle is the origin; in a case file, relative to that
-    file's folder."""
+    """The result of a correlation or of a harvest as JSON, of a specimen whose middle is the
+    origin; or modes as HDF5, whose cell is the RVE. In a case file, relative to its folder."""
+
+    @property
+    def is_computed(self) -> bool:
+        """Whether the file has modes at the nodes of a cell."""
+        return Path(self.path).suffix == ".h5"
 
 
 MODES: dict[str, type[Any]] = {
@@ -73,9 +78,9 @@ Mode = MeasuredMode | AnalyticMode | BlochMode | FileMode
 class HomogenizationOptions:
     """Choices of homogenization that matter; docs/homogenization.md says how much."""
 
-    centre: Literal["junction", "hole"] | None = None
-    """About which the RVE of 2 x 2 cells is cut; by default a junction in square stacking, in
-    triangular one a hole, about which its three modes are alike."""
+    centre: Literal["junction", "hole"] | tuple[float, float] | None = None
+    """About which the RVE of 2 x 2 cells is cut, or a point of it [mm]; by default a junction in
+    square stacking, in triangular one a hole, about which its three modes are alike."""
     positions: int = 1
     """RVEs along x and y at each point, whose mean counts: centred there and a ``positions``-th of
     a cell apart."""
@@ -167,7 +172,7 @@ class HomogenizationCase(CaseModel):
         return can if self.homogenization.quarter is None else self.homogenization.quarter
 
     @property
-    def centre(self) -> str:
+    def centre(self) -> str | tuple[float, float]:
         """About which the RVE is cut."""
         is_square = self.experiment.specimen.stacking == "square"
         return self.homogenization.centre or ("junction" if is_square else "hole")
@@ -223,6 +228,8 @@ class HomogenizationCase(CaseModel):
         if strain is not None and strain not in experiment.strains:
             raise InputError(f"mode: expected a strain among {experiment.strains}, got {strain}")
         count, numbers = len(FAMILIES[specimen.stacking](specimen)), self.mode.numbers
+        if isinstance(self.mode, FileMode) and self.mode.is_computed:
+            count = max(numbers, default=1)  # as many as the file has
         if len(set(numbers)) < len(numbers) or not set(numbers) <= set(range(1, count + 1)):
             raise InputError(
                 f"mode: expected different numbers from 1 to {count} in {specimen.stacking} "

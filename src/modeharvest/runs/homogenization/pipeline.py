@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from modeharvest.fem.bloch.modes import ModeSet, read_modes
+from modeharvest.fem.lattice.micromorphic.mesh import quadrature
 from modeharvest.fem.lattice.micromorphic.patterns import ModeField, PlaneWaves, rotation_pattern
 from modeharvest.fem.lattice.options import MacroLoading
 from modeharvest.idic.ansatz import Ansatz
@@ -64,6 +66,8 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.micromorphic.branches import Homogenized
     from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
 
+_SAME = 0.01
+"""By how much a cell of the same lattice may differ in its vectors and its solid share."""
 _CRITICAL = "load kind negative_before negative_after"
 _WAVES = {"square": [(np.pi, np.pi)], "triangular": [(np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)]}
 """Of the modes by stacking, in the order of ``FAMILIES``: phases along a1 and a2 [rad]."""
@@ -193,8 +197,33 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @cached_property
     def _cell(self) -> UnitCell:
-        """The RVE's mesh: 2 x 2 cells, a hole's centre at the origin."""
+        """The RVE's mesh: that of modes from a file, or 2 x 2 cells, a hole at the origin."""
+        with requiring_dolfinx("homogenization needs"):
+            from modeharvest.fem.lattice.cells import UnitCell
+        if (given := self._computed) is not None:
+            return UnitCell(given.mesh, given.lattice)
         return self._primitive.enlarged(2, 2)
+
+    @cached_property
+    def _computed(self) -> ModeSet | None:
+        """Modes from a file of ``modeharvest modes``: of the specimen's lattice or a mesh's."""
+        mode, specimen = self.case.mode, self.case.experiment.specimen
+        if not (isinstance(mode, FileMode) and mode.is_computed):
+            return None
+        given, count = read_modes(mode.path)[0], max(mode.numbers, default=1)
+        if count > len(given.shapes):
+            raise InputError(f"{mode.path}: expected {count} modes, got {len(given.shapes)}")
+        steps = given.primitive @ np.linalg.inv(specimen.vectors)
+        share = quadrature(given.mesh, 3).weights.sum() / abs(np.linalg.det(given.lattice))
+        wanted = 1 - np.pi * specimen.diameter**2 / 4 / abs(np.linalg.det(specimen.vectors))
+        is_same = np.abs(steps - np.rint(steps)).max() < _SAME > abs(abs(np.linalg.det(steps)) - 1)
+        if self.case.homogenization.mesh is None and not (is_same and abs(share - wanted) < _SAME):
+            raise InputError(
+                f"{mode.path}: expected modes of the specimen's lattice, solid to {wanted:.1%}, "
+                f"got modes of a cell with vectors {given.primitive.round(4).tolist()} mm, solid "
+                f"to {share:.1%}; compute them for this specimen, or give a mesh of another body"
+            )
+        return given
 
     @cached_property
     def _primitive(self) -> UnitCell:
@@ -206,12 +235,18 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             of = hexagonal if specimen.is_staggered else square
             return of(specimen.pitch, specimen.diameter, self.case.homogenization.mesh_size)
 
+    @property
+    def _vectors(self) -> FloatArray:
+        """(2, 2) of the lattice as rows [mm]."""
+        given = self._computed
+        return self.case.experiment.specimen.vectors if given is None else given.primitive
+
     @cached_property
     def result(self) -> Result | None:
         """The correlation that the mode was measured by, if it was."""
         mode = self.case.mode
         if isinstance(mode, FileMode):
-            return Result.read(mode.path)
+            return None if mode.is_computed else Result.read(mode.path)
         if not isinstance(mode, MeasuredMode):
             return None
         return self.virtual.correlate()[self._measured_strain]
@@ -225,8 +260,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
     @property
     def _numbers(self) -> tuple[int, ...]:
         """Of the modes to use, from 0."""
-        specimen = self.case.experiment.specimen
-        every = range(len(FAMILIES[specimen.stacking](specimen)))
+        specimen, given = self.case.experiment.specimen, self._computed
+        every = range(len(FAMILIES[specimen.stacking](specimen) if given is None else given.shapes))
         return tuple(k - 1 for k in self.case.mode.numbers) or tuple(every)
 
     def _modes_of(self, parameters: FloatArray) -> tuple[LatticeMode, ...]:
@@ -305,6 +340,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         """phi in the RVE's coordinates; those that are not given are computed."""
         if modes:
             return [mode.snapped for mode in modes]
+        if self._computed is not None:
+            return [self._computed.shapes[k] for k in self._numbers]
         from modeharvest.fem.bloch.critical import critical_at
         from modeharvest.fem.bloch.real_modes import real_modes
         from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
@@ -330,9 +367,10 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
         specimen, half, n = experiment.specimen, 0.5 * experiment.specimen.pitch, how.positions
         junction = half, half / np.sqrt(3.0) if specimen.is_staggered else half
-        middle = junction if self.case.centre == "junction" else (0.0, 0.0)
+        known: dict[Any, Any] = {"junction": junction, "hole": (0.0, 0.0)}
+        middle = known.get(self.case.centre, self.case.centre)
         steps = (np.arange(n) + 0.5 - 0.5 * n) / n
-        centres = middle + np.array(list(product(steps, steps))) @ specimen.vectors
+        centres = middle + np.array(list(product(steps, steps))) @ self._vectors
         rves = [RVE(cell, experiment.material, modes, c, normalisation="given") for c in centres]
         plates = self.case.plates
         if how.mesh is None:
