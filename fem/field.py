@@ -32,7 +32,6 @@ T = TypeVar("T")
 FORMAT = "modeharvest-solution-1"
 COMPRESSED = {"compression": 6, "shuffle": True}
 """Of datasets in HDF5."""
-_CORNERS = {"T3": 3, "T6": 3, "Q4": 4, "Q8": 4, "Q9": 4}
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
 MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
 
@@ -77,7 +76,7 @@ def boundary_sides(mesh: Mesh) -> IntArray:
 
     The material lies to their left; without mid-side nodes the second column repeats the first.
     """
-    corners = _CORNERS[mesh.element]
+    corners = 3 if mesh.element in ("T3", "T6") else 4
     has_middle = mesh.cells.shape[1] > corners
     sides = []
     for k in range(corners):
@@ -264,8 +263,7 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     u = np.asarray(source.point_data[displacement], dtype=np.float64)
     if u.ndim != 2 or u.shape[1] not in (2, 3):
         raise InputError(f"expected {displacement!r} of 2 or 3 components in {path}, got {u.shape}")
-    snapshot = Snapshot(nominal_strain, np.ascontiguousarray(u[:, :2]))
-    return Solution(mesh, (snapshot,), {"source": str(path)})
+    return Solution(mesh, (Snapshot(nominal_strain, u[:, :2].copy()),), {"source": str(path)})
 
 
 def read_plane_mesh(path: Path | str) -> Mesh:
@@ -283,6 +281,4 @@ def plane_mesh(source: meshio.Mesh, path: Path | str) -> Mesh:
     if len(found) != 1:
         known = list(MESHIO_NAME.values())
         raise InputError(f"expected one type of cells among {known} in {path}, got {types}")
-    name = MESHIO_NAME[found[0]]
-    cells = np.vstack([block.data for block in source.cells if block.type == name])
-    return Mesh(source.points[:, :2], cells, found[0])
+    return Mesh(source.points[:, :2], source.get_cells_type(MESHIO_NAME[found[0]]), found[0])
