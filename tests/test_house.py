@@ -26,7 +26,8 @@ HOMOGENIZATION = (
     "src/modeharvest/cli/homogenization.py",
     "src/modeharvest/report/homogenization.py", "src/modeharvest/report/figures/homogenization.py",
 )  # fmt: skip
-OWN_BOUNDS = {HOMOGENIZATION: (18, 3_480)}
+OWN_CELLS = ("fem/lattice/foreign.py",)
+OWN_BOUNDS = {HOMOGENIZATION: (18, 3_480), OWN_CELLS: (1, 200)}
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 
 PRIVATE_WORDS = """

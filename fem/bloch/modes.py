@@ -10,6 +10,7 @@ m modes on a cell of n nodes::
     lattice (2, 2) [mm], rows a1, a2 of this cell      primitive (2, 2) of the lattice itself
     waves (m, 2) [rad], phases (k . a1, k . a2) from primitive cell to primitive cell
     eigenvalues (m,) [N/mm^4]          shapes (m, n, 2) [-]      gradient (2, 2) F̄ [-]
+    origin (n,) numbers of the nodes in the user's own file, -1: not in it; only where there is one
     branches/0000/combination (m,)  curve (p, 2) amplitude [mm], load [-]   @outcome
     branches/0000/states/0000/displacement (n, 2) [mm]  gradient  stress [MPa]
                               amplitudes (m,) [mm]      @load @energy @primary_energy [MPa]
@@ -40,7 +41,7 @@ from modeharvest.fem.field import (
     write_values,
 )
 from modeharvest.fem.lattice.options import Wave
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
 
@@ -69,6 +70,8 @@ class ModeSet:
     """Load parameter and F̄ (2, 2) of the state whose tangent the modes belong to [-]."""
     info: Mapping[str, Any] = field(default_factory=dict)
     """Plain JSON values: lattice, material, loading, where it is critical, versions."""
+    origin: IntArray | None = None
+    """(n,) ``UnitCell.origin`` of each node, that of the node that it is a copy of."""
 
     def __post_init__(self) -> None:
         count = len(self.waves)
@@ -136,6 +139,8 @@ def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = (
         file["waves"] = np.asarray(modes.waves, dtype=np.float64)
         for name in _OF_SET:
             file[name] = getattr(modes, name)
+        if modes.origin is not None:
+            file["origin"] = modes.origin
         for k, branch in enumerate(branches):
             _write_branch(file.create_group(f"branches/{k:04d}"), branch)
 
@@ -148,6 +153,7 @@ def read_modes(path: Path | str) -> tuple[ModeSet, tuple[Branch, ...]]:
             waves=tuple((float(p), float(q)) for p, q in file["waves"][:]),
             load=float(file.attrs["load"]),
             info=json.loads(file.attrs["info"]),
+            origin=file["origin"][:] if "origin" in file else None,
             **{name: file[name][:] for name in ("shapes", *_OF_SET)},
         )
         groups = file.get("branches", {})
@@ -192,9 +198,9 @@ def _write_meshio(
         _comment(temporary, _described(modes, branches))
 
 
-def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, FloatArray]:
+def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
     """Nodal vectors by names with their meaning and unit."""
-    named = {}
+    named: dict[str, Any] = {} if modes.origin is None else {"node_in_file": modes.origin}
     for k, (wave, shape) in enumerate(zip(modes.waves, modes.shapes, strict=True), start=1):
         phases = "_".join(f"{phase / np.pi:.4g}pi" for phase in wave)
         named[f"mode_{k}_phases_{phases}_unit_mean_square"] = shape

@@ -87,6 +87,7 @@ def real_modes(
         load=state.load,
         gradient=state.gradient,
         info={**(info or {}), "copies": [m, n], "versions": {"modeharvest": __version__}},
+        origin=_origin(cell.cell, places),
     )
 
 
@@ -138,6 +139,16 @@ def _copies(cell: UnitCell, enlarged: UnitCell, shifts: Shifts) -> NDArray[np.in
     tree = cKDTree(enlarged.mesh.nodes)
     moved = [cell.mesh.nodes + np.array(shift) @ cell.lattice for shift in shifts]
     return np.stack([tree.query(nodes)[1] for nodes in moved])
+
+
+def _origin(cell: UnitCell, places: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """``UnitCell.origin`` on the enlarged mesh; of nodes that two copies share the first one's."""
+    if cell.origin is None:
+        return None
+    origin = np.empty(places.max() + 1, dtype=np.int64)
+    for place in places[::-1]:
+        origin[place] = cell.origin
+    return origin
 
 
 def _real_fields(

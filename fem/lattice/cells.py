@@ -34,7 +34,7 @@ from modeharvest.fem.meshing import (
     quarter_cell,
     require_size,
 )
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
 
@@ -49,6 +49,10 @@ class UnitCell:
     """T6 [mm]."""
     lattice: FloatArray
     """Lattice vectors a1 and a2 as rows (2, 2) [mm]."""
+    origin: IntArray | None = None
+    """(n,) the number in its file of each node, see ``files``; -1 for one that is not in it."""
+    notes: tuple[str, ...] = ()
+    """What a reader of results should know of the mesh, as sentences."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lattice", np.array(self.lattice, dtype=np.float64))
@@ -68,8 +72,12 @@ class UnitCell:
         """The cell of m x n copies along a1 and a2, at least one along either."""
         if m < 1 or n < 1:
             raise InputError(f"enlarged cell: expected at least 1 x 1 copies, got {m} x {n}")
+        # Partners' places agree to rounding first: what passed the check is joined.
+        _, first = np.unique(self.periodicity.master, return_index=True)
+        nodes = self.mesh.nodes[first[self.periodicity.master]]
+        nodes = nodes + self.periodicity.shift @ self.lattice
         blocks = [
-            MeshBlock(self.mesh.nodes + np.array([i, j]) @ self.lattice, self.mesh.cells)
+            MeshBlock(nodes + np.array([i, j]) @ self.lattice, self.mesh.cells)
             for i, j in product(range(m), range(n))
         ]
         shortest = float(np.linalg.norm(self.lattice, axis=1).min())

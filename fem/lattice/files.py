@@ -1,8 +1,8 @@
 """Unit cells from files: a mesh that meshio reads, a geometry or a model of gmsh.
 
-Lengths are millimetres. Triangles become a plane T6 mesh, counter-clockwise, neither flat nor
-folded. What the copies of a cell must do to fit together is checked by ``periodicity``, which
-names the nodes that don't.
+Lengths are millimetres, but for the file's own, of which the unit can be stated. Triangles become a
+plane T6 mesh, see ``foreign``. What the copies of a cell must do to fit together is checked by
+``periodicity``, which names the nodes that don't.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import gmsh
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.fem.field import Mesh, read_any_mesh, with_mid_sides
+from modeharvest.fem.field import Mesh, read_any_mesh
 from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.lattice.foreign import millimetres, require_unit, sound_t6
 from modeharvest.fem.lattice.options import lattice_vectors
-from modeharvest.fem.meshing import REVERSED_T6, gmsh_options, quiet_gmsh, require_size
+from modeharvest.fem.meshing import gmsh_options, quiet_gmsh, require_size
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading, require_file
@@ -38,22 +39,28 @@ _PROBE_SECONDS = 300.0
 _FARTHEST = 1e9
 """From the origin [mm]; a damaged file's nodes are anywhere."""
 _LOWER = ("vertex", "line")  # what meshes hold besides their elements
-_SIDES = ((0, 1), (1, 2), (2, 0))
 
 
 def read_cell(
-    path: Path | str, lattice: ArrayLike | None = None, size: float | None = None
+    path: Path | str,
+    lattice: ArrayLike | None = None,
+    size: float | None = None,
+    unit: str | None = None,
 ) -> UnitCell:
     """Read the unit cell of a lattice from a file.
 
-    An InputError refuses one that is damaged, no plane mesh of sound triangles, or not periodic.
+    Nodes keep the file's order, ``UnitCell.origin`` says which is which, ``notes`` what had to be
+    changed. An InputError refuses a file that is damaged, no plane mesh of sound triangles or not
+    periodic, and asks for the unit where the cell is unusually small or large.
 
-    path : a plane mesh [mm] of six-node triangles, in any format of meshio or gmsh; three-node
-        triangles get straight sides with nodes in their middle. Or a geometry for gmsh to mesh
-        (suffixes ``GEOMETRY``). A gmsh file's physical surfaces, if any, are the material.
+    path : a plane mesh of six-node triangles, in any format of meshio or gmsh; three-node triangles
+        get straight sides with nodes in their middle. Or a geometry for gmsh to mesh (suffixes
+        ``GEOMETRY``). A gmsh file's physical surfaces, if any, are the material.
     lattice : (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is a rectangle along x
         and y, as wide and as high as its material.
     size : largest edge length [mm] of the elements of a geometry; None: what it says itself.
+    unit : of the file's own lengths, one of ``foreign.MILLIMETRES``; None: mm. STEP and IGES files
+        say it themselves, and come in mm.
     """
     path = Path(path)
     require_file(path, "a cell (mesh or geometry)", "draw or export one")
@@ -64,15 +71,18 @@ def read_cell(
         _require_readable(path)
         with quiet_gmsh():
             _merge(path)
-            return _from_model(lattice, size, is_geometry, str(path))
+            return _from_model(lattice, size, is_geometry, str(path), unit)
     source = read_any_mesh(path)
     blocks: dict[str, list[IntArray]] = {}
     for block in source.cells:
         blocks.setdefault(block.type, []).append(np.asarray(block.data, dtype=np.int64))
-    return _unit_cell(np.asarray(source.points, dtype=np.float64), blocks, lattice, str(path))
+    points = np.asarray(source.points, dtype=np.float64)
+    return _unit_cell(points, blocks, np.arange(len(points)), lattice, str(path), unit)
 
 
-def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) -> UnitCell:
+def cell_from_gmsh(
+    lattice: ArrayLike | None = None, size: float | None = None, unit: str | None = None
+) -> UnitCell:
     """The unit cell in gmsh's current model, which stays open.
 
     If the model has a mesh, that is taken as it is; if not, it is meshed with sides that are
@@ -82,7 +92,7 @@ def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) 
         raise InputError("expected a gmsh model, got none: call gmsh.initialize() and build one")
     with gmsh_options({"General.Terminal": 0, "Mesh.MeshSizeMax": 1e22}):
         to_mesh = not gmsh.model.mesh.getElementTypes(2).size
-        return _from_model(lattice, size, to_mesh, "gmsh model")
+        return _from_model(lattice, size, to_mesh, "gmsh model", unit)
 
 
 def _require_readable(path: Path) -> None:
@@ -107,16 +117,18 @@ def _merge(path: Path) -> None:
 
 
 def _from_model(
-    lattice: ArrayLike | None, size: float | None, to_mesh: bool, source: str
+    lattice: ArrayLike | None, size: float | None, to_mesh: bool, source: str, unit: str | None
 ) -> UnitCell:
     """The cell in gmsh's current model."""
+    mm = millimetres(unit)
     if size is not None:
         low, high = np.reshape(gmsh.model.getBoundingBox(-1, -1), (2, 3))[:, :2]
-        require_size(size, float(np.prod(high - low)))
-        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+        require_size(size, mm**2 * float(np.prod(high - low)))
+        gmsh.option.setNumber("Mesh.MeshSizeMax", size / mm)
     if to_mesh:
         try:
-            _mesh_periodically(lattice)
+            given = None if lattice is None else lattice_vectors(lattice, "periodic cell")
+            _mesh_periodically(None if given is None else np.asarray(given / mm))
         except InputError as error:
             raise InputError(f"{source}: {error}") from error
         except Exception as error:  # gmsh raises nothing else
@@ -124,14 +136,14 @@ def _from_model(
                 f"{source}: gmsh can't mesh it ({_message(error)}); holes must neither overlap nor "
                 "touch each other"
             ) from error
-    return _unit_cell(*_current_mesh(), lattice, source)
+    return _unit_cell(*_current_mesh(), lattice, source, unit)
 
 
 def _message(error: Exception) -> str:
     return " ".join((str(error) or gmsh.logger.getLastError()).split())
 
 
-def _mesh_periodically(lattice: ArrayLike | None) -> None:
+def _mesh_periodically(lattice: FloatArray | None) -> None:
     """T6 mesh of the current model whose sides are divided alike where a translation maps them."""
     mesh = gmsh.model.mesh
     mesh.clear()
@@ -140,7 +152,8 @@ def _mesh_periodically(lattice: ArrayLike | None) -> None:
     _refuse_crossing({tag for _, tag in gmsh.model.getBoundary(surfaces, False, False)})
     curves = [tag for _, tag in gmsh.model.getBoundary(surfaces, combined=True, oriented=False)]
     if curves:
-        vectors = _lattice(lattice, mesh.getNodes()[1].reshape(-1, 3)[:, :2])
+        width = np.ptp(mesh.getNodes()[1].reshape(-1, 3)[:, :2], axis=0)
+        vectors = np.diag(width) if lattice is None else lattice
         for a, b, shift in _translates([_ends_and_middle(tag) for tag in curves], vectors):
             if mesh.getPeriodicNodes(1, curves[b])[0] == curves[b]:  # not set by the user
                 affine = np.eye(4)
@@ -205,8 +218,11 @@ def _translates(
     return found
 
 
-def _current_mesh() -> tuple[FloatArray, Blocks]:
-    """Nodes (n, 3) [mm] and elements of gmsh's current model: of its material, if it names one."""
+def _current_mesh() -> tuple[FloatArray, Blocks, IntArray]:
+    """Nodes (n, 3), elements and nodes' tags (n,) of gmsh's current model.
+
+    Of its material, if it names one.
+    """
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
     of_group = gmsh.model.getEntitiesForPhysicalGroup
@@ -218,13 +234,21 @@ def _current_mesh() -> tuple[FloatArray, Blocks]:
             name = {(1, 3): "triangle", (2, 6): "triangle6"}.get((degree, count), f"{count}-node")
             place = np.searchsorted(tags[order], nodes).reshape(-1, count)
             cells.setdefault(name, []).append(place.astype(np.int64))
-    return coordinates.reshape(-1, 3)[order], cells
+    return coordinates.reshape(-1, 3)[order], cells, tags[order].astype(np.int64)
 
 
 def _unit_cell(
-    points: FloatArray, blocks: Blocks, lattice: ArrayLike | None, source: str
+    points: FloatArray,
+    blocks: Blocks,
+    names: IntArray,
+    lattice: ArrayLike | None,
+    source: str,
+    unit: str | None,
 ) -> UnitCell:
-    """Check a mesh as it is in files, put it in order, and find its periodicity."""
+    """Check a mesh as it is in files, put it in order, and find its periodicity.
+
+    ``points`` and elements as the file has them; ``names`` (n,) are the nodes' numbers in it.
+    """
     cells = {name: np.vstack(parts) for name, parts in blocks.items()}
     kinds = sorted(name for name in cells if not name.startswith(_LOWER) and len(cells[name]))
     if kinds not in (["triangle"], ["triangle6"]):
@@ -235,10 +259,15 @@ def _unit_cell(
     if not np.abs(points).max(initial=0.0) < _FARTHEST:
         raise InputError(f"{source}: expected finite nodes less than {_FARTHEST:g} mm from 0")
     try:
-        mesh = sound_t6(points, cells[kinds[0]])
-        if lattice is None:
+        vectors = None if lattice is None else lattice_vectors(lattice, "periodic cell")
+        if unit is None:
+            require_unit(points[np.unique(cells[kinds[0]])][:, :2], vectors)
+        found = sound_t6(millimetres(unit) * points, cells[kinds[0]])
+        mesh, names = found.mesh, np.append(names, -1)
+        if vectors is None:
             _refuse_unless_rectangular(mesh)
-        return UnitCell(mesh, _lattice(lattice, mesh.nodes))
+            vectors = np.diag(np.ptp(mesh.nodes, axis=0))
+        return UnitCell(mesh, vectors, names[found.origin], found.notes)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
 
@@ -254,71 +283,3 @@ def _refuse_unless_rectangular(mesh: Mesh) -> None:
             "expected lattice vectors as two rows, because the cell does not fill a rectangle of "
             f"{high[0] - low[0]:.5g} x {high[1] - low[1]:.5g} mm along x and y, got none"
         )
-
-
-def _lattice(given: ArrayLike | None, nodes: FloatArray) -> FloatArray:
-    """The lattice vectors given, or those of a rectangle around the nodes."""
-    if given is None:
-        return np.diag(np.ptp(nodes, axis=0))
-    return lattice_vectors(given, "periodic cell")
-
-
-def sound_t6(points: FloatArray, cells: IntArray) -> Mesh:
-    """A plane T6 mesh, counter-clockwise, without unused nodes.
-
-    From points (n, 2), or (n, 3) with z = const [mm], and cells (m, 3) or (m, 6), corners first;
-    sides of three-node triangles get a node in their middle. An InputError refuses a mesh that
-    isn't plane, has elements upon each other, or a flat or folded one.
-    """
-    used, numbers = np.unique(cells, return_inverse=True)
-    nodes, cells = _in_plane(points[used]), numbers.reshape(cells.shape).astype(np.int64)
-    if cells.shape[1] == 3:
-        nodes, cells = with_mid_sides(nodes, cells)
-    a, b, c = (nodes[cells[:, k]] for k in range(3))
-    clockwise = np.linalg.det(np.stack([b - a, c - a], axis=1)) < 0
-    cells = np.where(clockwise[:, None], cells[:, REVERSED_T6], cells)
-    mesh = Mesh(nodes, cells, "T6")
-    middle, count = np.unique(cells[:, 3:], return_counts=True)
-    if count.max() > 2:
-        x, y = nodes[middle[np.argmax(count)]]
-        raise InputError(
-            f"expected sides of one or two elements, got one of {count.max()} at ({x:.5g}, "
-            f"{y:.5g}) mm; elements must not lie upon each other"
-        )
-    bad = np.flatnonzero(_smallest_jacobians(mesh) <= 0)
-    if len(bad):
-        x, y = nodes[cells[bad[0], :3]].mean(axis=0)
-        raise InputError(
-            f"expected elements that are neither flat nor folded, got {len(bad)}, the first at "
-            f"({x:.5g}, {y:.5g}) mm"
-        )
-    return mesh
-
-
-def _in_plane(points: FloatArray) -> FloatArray:
-    if not np.isfinite(points).all():
-        raise InputError("expected finite node positions, got NaN or infinity")
-    if points.shape[1] == 3 and np.ptp(points[:, 2]) > 1e-9 * np.ptp(points[:, :2]):
-        low, high = points[:, 2].min(), points[:, 2].max()
-        raise InputError(f"expected a plane mesh, z = const, got z from {low:.5g} to {high:.5g} mm")
-    return points[:, :2]
-
-
-def _smallest_jacobians(mesh: Mesh) -> FloatArray:
-    """(m,) lower bounds of the Jacobians [mm^2]: their smallest Bernstein coefficients."""
-    at = np.linalg.det(np.einsum("pna,mnb->mpab", _GRADIENTS, mesh.nodes[mesh.cells]))
-    sides = [2 * at[:, 3 + k] - 0.5 * (at[:, p] + at[:, q]) for k, (p, q) in enumerate(_SIDES)]
-    return np.asarray(np.minimum(at[:, :3].min(axis=1), np.min(sides, axis=0)))
-
-
-def _gradients(xi: float, eta: float) -> FloatArray:
-    """(6, 2) derivatives of the shape functions."""
-    z = 1.0 - xi - eta
-    by_xi = [1 - 4 * z, 4 * xi - 1, 0.0, 4 * (z - xi), 4 * eta, -4 * eta]
-    by_eta = [1 - 4 * z, 0.0, 4 * eta - 1, -4 * xi, 4 * xi, 4 * (z - eta)]
-    return np.stack([by_xi, by_eta], axis=1)
-
-
-# At the element's own nodes, which determine a Jacobian that is quadratic.
-_NODES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
-_GRADIENTS = np.array([_gradients(xi, eta) for xi, eta in _NODES])

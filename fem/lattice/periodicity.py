@@ -21,7 +21,8 @@ from modeharvest.fem.lattice.options import lattice_vectors
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
-_SAME_PLACE = 1e-6  # of the shorter lattice vector: largest distance of partners
+SAME_PLACE = 1e-6
+"""Of the shorter lattice vector: nodes that near to each other, copies moved, are the same."""
 # Neighbours that can touch a cell whose outline reaches no further than two cells.
 _NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
 
@@ -56,7 +57,7 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray) -> Periodicity:
     if mesh.element != "T6":
         raise InputError(f"periodic cell: expected a T6 mesh, got {mesh.element}")
     lattice = lattice_vectors(lattice, "periodic cell")
-    distance = _SAME_PLACE * float(np.linalg.norm(lattice, axis=1).min())
+    distance = SAME_PLACE * float(np.linalg.norm(lattice, axis=1).min())
     pairs = _pairs(mesh.nodes, lattice, distance)
     sides = boundary_sides(mesh)
     _refuse_overlap(mesh, lattice, np.unique(sides))

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, runtime_checkable
 
+import numpy as np
 from pydantic import model_validator
 
 from modeharvest.fem.bloch.dispersion import ZONES
@@ -134,20 +135,29 @@ class FileLattice:
     """A cell of one's own, a mesh or a geometry: ``fem.lattice.files.read_cell``."""
 
     path: str
-    """The file [mm]; in a case file, relative to that file's folder."""
+    """The file; in a case file, relative to that file's folder."""
     pitch: float
     """Unit cell size l [mm], the unit of wave lengths in spectra."""
     vectors: tuple[tuple[float, float], tuple[float, float]] | None = None
     """a1 and a2 as rows [mm]; None: a rectangle along x and y, as large as the material."""
     mesh_size: float | None = None
     """Largest edge length [mm] where a geometry is meshed; None for a mesh."""
+    unit: str | None = None
+    """Of the file's own lengths, "m" or "um" for instance; None: mm, and asked for if unlikely."""
     symmetry = "oblique"
 
     def cell(self) -> UnitCell:
         """The cell as the file has it."""
         from modeharvest.fem.lattice.files import read_cell
 
-        return read_cell(self.path, self.vectors, self.mesh_size)
+        cell = read_cell(self.path, self.vectors, self.mesh_size, self.unit)
+        shortest = float(np.linalg.norm(cell.lattice, axis=1).min())
+        if not 0.01 < self.pitch / shortest < 100:
+            raise InputError(
+                f"{self.path}: expected the pitch l in mm, about the distance of the holes in a "
+                f"cell whose shorter vector is {shortest:.4g} mm long, got {self.pitch}"
+            )
+        return cell
 
 
 LATTICES: dict[str, type[Any]] = {

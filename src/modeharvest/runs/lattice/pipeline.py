@@ -311,7 +311,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             patterns=self._shown(modes) if modes and "families" in done else (),
             study=self.case.run_study(self.folder / "study.csv", self.progress)
             if "study" in done else None,  # of which the rows are all there
-            notes=[note for note in (self._why_no_modes(critical),) if note],
+            notes=[*unit.notes, *filter(None, [self._why_no_modes(critical)])],
             exports=results.exports_in(self.folder),
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
         )  # fmt: skip
