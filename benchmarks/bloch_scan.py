@@ -5,7 +5,8 @@ zone's boundary, assembly and all, with 60 sparse factorisations of the reduced 
 order of elimination is known, or found anew each time. They take turns in one process, and the
 ratios are medians over the turns.
 ``… critical`` prints the table of docs/bloch.md, ``… rates`` the order of convergence on nested
-meshes, and ``… study`` ten lattices under three loadings with the time and the memory they take.
+meshes, ``… splitting`` what a mesh does to a degenerate set, and ``… study`` ten lattices under
+three loadings with the time and the memory they take.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 
+import gmsh
 import numpy as np
 from refinement import refined_cell
 
@@ -25,6 +27,7 @@ from modeharvest.fem.bloch.eigen import BlochWaves, scan
 from modeharvest.fem.lattice.bloch_map import factorise
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.files import cell_from_gmsh
 from modeharvest.fem.lattice.options import (
     CriticalSearch,
     MacroLoading,
@@ -109,7 +112,7 @@ def nested(cell: UnitCell, diameter: float, count: int) -> list[UnitCell]:
 
 def rate(cells: Sequence[UnitCell], loading: MacroLoading, material: Material) -> str:
     """Critical strain of one wave mesh by mesh, and the orders of its convergence."""
-    search = CriticalSearch(tolerance=1e-12)
+    search = CriticalSearch()
     paths = [CellPath(PeriodicCell(cell, material), loading) for cell in cells]
     wave = first_critical(paths[0]).waves[0]
     loads = np.array([critical_at(path, wave, search).load for path in paths])
@@ -137,6 +140,24 @@ def rates(count: int) -> None:
     print(f"| {families[0][0]} | compressible | equibiaxial | {values}", flush=True)
 
 
+def splitting() -> None:
+    """By how much gmsh's mesh of a rhombus splits the three M points of hexagonal stacking."""
+    vectors = np.array([[1.0, 0.0], [0.5, 0.75**0.5]])
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    occ = gmsh.model.occ
+    ends = [occ.addPoint(*(r @ vectors), 0.0) for r in ([0, 0], [1, 0], [1, 1], [0, 1])]
+    sides = [occ.addLine(*pair) for pair in zip(ends, ends[1:] + ends[:1], strict=True)]
+    plate = occ.addPlaneSurface([occ.addCurveLoop(sides)])
+    holes = [occ.addDisk(*(r @ vectors), 0.0, 0.45, 0.45) for r in ([0, 0], [0, 1], [1, 0], [1, 1])]
+    occ.cut([(2, plate)], [(2, hole) for hole in holes])
+    occ.synchronize()
+    cell = cell_from_gmsh(vectors, 0.1)
+    gmsh.finalize()
+    found = first_critical(CellPath(PeriodicCell(cell, TwoTermI1()), equibiaxial()))
+    print(f"{found.outcome}: split by {found.splitting:.3%}, bound {found.splitting_bound:.3%}")
+
+
 def study() -> None:
     start, used = time.perf_counter(), time.process_time()
     print("| d/l | loading | critical | CPU s |")
@@ -154,7 +175,7 @@ def study() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("what", choices=["cost", "critical", "rates", "study"])
+    parser.add_argument("what", choices=["cost", "critical", "rates", "splitting", "study"])
     parser.add_argument("--sizes", type=int, nargs="+", default=(12, 24), help="elements a pitch")
     parser.add_argument("--meshes", type=int, default=4, help="number of nested meshes")
     asked = parser.parse_args()
@@ -164,6 +185,8 @@ def main() -> None:
         criticals(asked.sizes)
     elif asked.what == "rates":
         rates(asked.meshes)
+    elif asked.what == "splitting":
+        splitting()
     else:
         study()
 

@@ -14,14 +14,8 @@ from fem_bodies import FloatArray, plate
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from modeharvest.fem.bloch.critical import (
-    LatticeCritical,
-    Zone,
-    critical_at,
-    first_critical,
-    folded,
-    is_same,
-)
+from modeharvest.fem.bloch.critical import LatticeCritical, Zone, critical_at, first_critical
+from modeharvest.fem.bloch.degenerate import folded, is_same
 from modeharvest.fem.bloch.dispersion import ZONES, zone_path
 from modeharvest.fem.bloch.eigen import BlochWaves, scan
 from modeharvest.fem.lattice.bloch_map import Condensation, factorise

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import brentq, minimize
 
+from modeharvest.fem.bloch.degenerate import Degeneracy, folded, is_same
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves, scan
 from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
 from modeharvest.fem.lattice.options import CENTRE, CriticalSearch, Wave
@@ -25,7 +26,6 @@ from modeharvest.util.progress import Progress, silent
 
 _FIRST_STEP, _TOLERANCE = 1e-3, 1e-10  # of the load: to begin with; of the critical one
 _CANDIDATES = 3  # grid points from which to descend
-_SAME = 1e-3  # phases [rad] that far apart are the same wave
 _DEGENERATE = 1e-5  # of the measure at rest: values that far apart belong to one set
 _NOTHING = 1e-8  # of the moduli: what a mechanism's measure may be by rounding
 _BESIDE = 1e-6  # of the critical load: where the proof is made
@@ -46,20 +46,23 @@ class LeastStable:
 
 
 class Zone:
-    """Stability over all waves; an even number of ``divisions`` has the points M and X."""
+    """Stability over all waves, or some; an even number of ``divisions`` has M and X."""
 
-    def __init__(self, cell: PeriodicCell, divisions: int) -> None:
-        self.cell = cell
+    def __init__(self, cell: PeriodicCell, divisions: int, only: Sequence[Wave] = ()) -> None:
+        self.cell, self.only = cell, only
         inverse = np.linalg.inv(cell.cell.lattice)
         self._metric = inverse.T @ inverse  # |k|^2 = phases . metric . phases
         self._spacing = 2.0 * math.pi / divisions
         phases = [self._spacing * (n - (divisions - 1) // 2) for n in range(divisions)]
         points = [(p, q) for p in phases for q in phases if (p, q) != CENTRE]
         self.grid = [(p, q) for p, q in points if folded((p, q)) >= folded((-p, -q))]
+        self.grid = list(only) or self.grid
 
     def least_stable(self, state: CellState) -> LeastStable:
         """The wave with the smallest measure, over all of the zone."""
         waves = BlochWaves(self.cell, state)
+        if self.only:
+            return min((self.at(waves, wave) for wave in self.only), key=lambda one: one.value)
         value, angle = waves.long_wave()
         found = [LeastStable(state.load, value, CENTRE, angle), self.at(waves, CENTRE)]
         values = self.on_grid(waves)
@@ -71,15 +74,15 @@ class Zone:
     def at(self, waves: BlochWaves, wave: Wave) -> LeastStable:
         """The measure at one wave vector."""
         value = float(waves.lowest(wave).eigenvalues[0])
-        return LeastStable(waves.state.load, self._value(wave, value), wave)
+        return LeastStable(waves.state.load, self.measure(wave, value), wave)
 
     def on_grid(self, waves: BlochWaves) -> FloatArray:
         """The measure at every point of ``grid`` [MPa]."""
         lowest = scan(waves, self.grid)[:, 0]
         pairs = zip(self.grid, lowest, strict=True)
-        return np.array([self._value(wave, float(value)) for wave, value in pairs])
+        return np.array([self.measure(wave, float(value)) for wave, value in pairs])
 
-    def _value(self, wave: Wave, eigenvalue: float) -> float:
+    def measure(self, wave: Wave, eigenvalue: float) -> float:
         """filling * lambda / |k|^2 [MPa]; for modes with the cell's period over 4 / area."""
         squared = self._squared(wave)[0]
         squared = squared if squared > 1e-12 else 4.0 / self.cell.cell.area
@@ -105,7 +108,7 @@ class Zone:
             near[:] = [modes]
             squared, slope_of_squared = self._squared(wave)
             slope = waves.slope(modes) - modes.eigenvalues[0] * slope_of_squared / squared
-            value = self._value(wave, float(modes.eigenvalues[0]))
+            value = self.measure(wave, float(modes.eigenvalues[0]))
             return value, self.cell.filling * slope / squared
 
         # Off the grid, where symmetry may make a saddle look like a minimum; not as far as the
@@ -121,18 +124,6 @@ class Zone:
         return value, start
 
 
-def folded(wave: Wave) -> Wave:
-    """The same wave with both phases in (-pi, pi]."""
-    p, q = (math.pi - (math.pi - phase) % (2.0 * math.pi) for phase in wave)
-    return (p, q)
-
-
-def is_same(a: Wave, b: Wave) -> bool:
-    """Whether two waves are the same one, or each other's opposites."""
-    differences = (folded((a[0] - s * b[0], a[1] - s * b[1])) for s in (1.0, -1.0))
-    return any(max(abs(d[0]), abs(d[1])) < _SAME for d in differences)
-
-
 @dataclass(frozen=True, eq=False)
 class LatticeCritical:
     """Where a lattice first becomes unstable, or how far it was found to be stable."""
@@ -146,8 +137,9 @@ class LatticeCritical:
     least_stable: LeastStable
     """The least stable wave at ``load``."""
     waves: tuple[Wave, ...]
-    """All waves of the grid that are critical at ``load``: a degenerate set has more than one. k
-    and -k are the same mode and appear once. Empty for long waves."""
+    """All waves that are critical at ``load``: a degenerate set has more than one. They are on the
+    grid, or images of the least stable one under symmetries of lattice and load, even if the mesh
+    splits them slightly. k and -k are the same mode and appear once. Empty for long waves."""
     state: CellState
     """The equilibrium at ``load``."""
     history: tuple[LeastStable, ...]
@@ -156,6 +148,11 @@ class LatticeCritical:
     above: tuple[int, ...] = ()
     """Number of negative eigenvalues at each of ``waves`` a millionth of the load below and above
     the critical one: the proof."""
+    splitting: float = 0.0
+    """Largest measure among ``waves`` over what it is without load: by how much the mesh splits
+    modes that the lattice's symmetry makes equal [-]."""
+    splitting_bound: float = 0.0
+    """The same by images of the lowest mode, an upper bound by the min-max principle."""
     unstable_before: tuple[Wave, ...] = ()
     """Waves of the grid that are unstable already a millionth of the load below: this is the first
     critical point if there are none. Not looked for where one wave was given."""
@@ -166,26 +163,31 @@ def first_critical(
 ) -> LatticeCritical:
     """The first critical load over all wave vectors, along the path of a primitive cell.
 
+    Or over those that the search names. A mode of the cell's own period has the wave (0, 0).
     InputError if the lattice is a mechanism: a wave costs no energy without load.
     """
     search = search or CriticalSearch()
-    zone = Zone(path.cell, search.divisions)
+    zone = Zone(path.cell, search.divisions, search.phases)
     return _LoadSearch(path, search, zone, zone.least_stable, progress, zone.grid).run()
 
 
 def critical_at(
-    path: CellPath, wave: Wave, search: CriticalSearch | None = None
+    path: CellPath, wave: Wave | None, search: CriticalSearch | None = None
 ) -> LatticeCritical:
     """The first load at which the given wave is critical, whatever the others do.
 
     (0, 0) stands for the modes with the period of the cell, which may be an enlarged one. F̄ is
-    fixed while a mode grows.
+    fixed while a mode grows. None stands for waves much longer than the cell.
     """
     search = search or CriticalSearch()
     zone = Zone(path.cell, search.divisions)
 
     def measure(state: CellState) -> LeastStable:
-        return zone.at(BlochWaves(path.cell, state), wave)
+        waves = BlochWaves(path.cell, state)
+        if wave is None:
+            value, angle = waves.long_wave()
+            return LeastStable(state.load, value, CENTRE, angle)
+        return zone.at(waves, wave)
 
     return _LoadSearch(path, search, zone, measure, silent).run()
 
@@ -250,14 +252,16 @@ class _LoadSearch:
         load = float(brentq(value, low, high, xtol=_TOLERANCE, rtol=1e-14))
         value(load)
         least, state = self.history[load], self._near(low, load)
-        waves = () if least.angle is not None else self._critical_waves(state, least)
+        none: tuple[tuple[Wave, ...], float, float] = ((), 0.0, 0.0)
+        waves, split, bound = none if least.angle is not None else self._set(state, least)
         before, after = (self._near(low, load * (1.0 + side)) for side in (-_BESIDE, _BESIDE))
         below, above = self._unstable(before, waves), self._unstable(after, waves)
         earlier = BlochWaves(self.path.cell, before).unstable_among(self.everywhere)
         kind = "long waves" if least.angle is not None else f"{len(waves)} wave vector(s)"
         text = f"critical at {load:.6g} for {kind}"
         text += f"; but {len(earlier)} others are unstable before" if earlier else ""
-        known = (waves, state, self._by_load(), below, above, earlier)
+        text += self._where
+        known = (waves, state, self._by_load(), below, above, split, bound, earlier)
         return LatticeCritical(load, True, text, least, *known)
 
     def _near(self, low: float, load: float) -> CellState:
@@ -276,23 +280,38 @@ class _LoadSearch:
     def _stable(self, load: float, outcome: str) -> LatticeCritical:
         state = self.path.at(load)
         assert state is not None
-        return LatticeCritical(load, False, outcome, self.history[load], (), state, self._by_load())
+        known = ((), state, self._by_load())
+        return LatticeCritical(load, False, outcome + self._where, self.history[load], *known)
 
-    def _critical_waves(self, state: CellState, least: LeastStable) -> tuple[Wave, ...]:
-        """The least stable wave, and those of the grid that are critical with it."""
-        if least.wave == CENTRE:
-            return (CENTRE,)
-        values = self.zone.on_grid(BlochWaves(self.path.cell, state))
-        small = np.abs(values) < _DEGENERATE * self.history[0.0].value
-        also = [wave for wave, is_small in zip(self.zone.grid, small, strict=True) if is_small]
-        return (least.wave, *(wave for wave in also if not is_same(wave, least.wave)))
+    @property
+    def _where(self) -> str:
+        count = len(self.zone.only)
+        return f"; looked for at the {count} wave(s) asked for only" if count else ""
+
+    def _set(self, state: CellState, least: LeastStable) -> tuple[tuple[Wave, ...], float, float]:
+        """The least stable wave and those that are critical with it; how far the mesh splits them.
+
+        They are critical at the same points of the grid, or images by symmetry.
+        """
+        waves, rest = BlochWaves(self.path.cell, state), self.history[0.0].value
+        small = np.abs(self.zone.on_grid(waves)) < _DEGENERATE * rest
+        every = [wave for wave, is_small in zip(self.zone.grid, small, strict=True) if is_small]
+        lowest, degeneracy = waves.lowest(least.wave), Degeneracy(waves)
+        found = [least.wave]
+        for wave in (*degeneracy.waves(least.wave), *every):
+            if not any(is_same(wave, other) for other in found):
+                found.append(wave)
+        split = max(abs(self.zone.at(waves, wave).value) for wave in found) / rest
+        bound = self.zone.measure(least.wave, degeneracy.bound(lowest)) / rest
+        return tuple(found), split, max(bound, split)
 
     def _unstable(self, state: CellState, critical: tuple[Wave, ...]) -> tuple[int, ...]:
         """Negative eigenvalues at the critical waves; at Γ the translations don't count."""
         waves = BlochWaves(self.path.cell, state)
-        if CENTRE in critical:  # then it is the only one
-            return (int(np.sum(waves.lowest(CENTRE, 4).eigenvalues < 0)),)
-        return tuple(waves.unstable(wave) for wave in critical)
+        return tuple(
+            int(np.sum(waves.lowest(CENTRE, 4).eigenvalues < 0)) if wave == CENTRE
+            else waves.unstable(wave) for wave in critical
+        )  # fmt: skip
 
     def _by_load(self) -> tuple[LeastStable, ...]:
         return tuple(self.history[load] for load in sorted(self.history))

@@ -98,11 +98,11 @@ class BlochWaves:
         return negative_pivots(factorise(self.stiffness(wave_of(wave))))
 
     def unstable_among(self, points: Sequence[Wave]) -> tuple[Wave, ...]:
-        """Those wave vectors, not Γ, at which K is not positive definite: proven by Cholesky."""
+        """Those wave vectors but Γ at which K is not positive definite: proven by Cholesky."""
         self.factorisations += 1
         condensation = Condensation(self.state.stiffness, self.cell.reduction.boundary)
         waves = phases_of(points)
-        bad = [condensation.at(wave[None]) is None for wave in waves]
+        bad = [np.any(wave) and condensation.at(wave[None]) is None for wave in waves]
         return tuple(wave for wave, is_bad in zip(points, bad, strict=True) if is_bad)
 
     def slope(self, modes: BlochModes) -> FloatArray:

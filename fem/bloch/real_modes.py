@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.fem.bloch.critical import is_same
+from modeharvest.fem.bloch.degenerate import Degeneracy, is_same
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves
 from modeharvest.fem.bloch.modes import ModeSet
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
@@ -32,7 +32,7 @@ Shifts = Sequence[tuple[int, int]]  # of copies, along a1 and a2
 
 _SNAP = 1e-3  # rad: how near to a fraction a wave found by descent is
 _DEGENERATE = 1e-6  # of the eigenvalues' scale: values that far apart belong to one set
-_MULTIPLICITY = 4  # the most modes of one wave that are looked for
+_MULTIPLICITY = 6  # the most modes of one wave that are looked for
 _TOLERANCE = 1e-18  # of an eigenvalue; of a mode it is the root of this
 _LARGE = 0.9  # of the largest component: the first such fixes the phase
 
@@ -72,7 +72,8 @@ def real_modes(
     enlarged, bloch = cell.cell.enlarged(m, n), BlochWaves(cell, state)
     shifts = list(product(range(m), range(n)))
     places = _copies(cell.cell, enlarged, shifts)
-    found = [_lowest_set(bloch, _phases(turn)) for turn in turns]
+    degeneracy = Degeneracy(bloch)
+    found = [_lowest_set(degeneracy, _phases(turn)) for turn in turns]
     shapes = [_real_fields(cell, modes, shifts, places) for modes in found]
     repeats = [len(s) // len(modes.eigenvalues) for s, modes in zip(shapes, found, strict=True)]
     return ModeSet(
@@ -110,12 +111,13 @@ def _phases(turns: Turns) -> Wave:
     return (p, q)
 
 
-def _lowest_set(bloch: BlochWaves, wave: Wave) -> BlochModes:
-    """The lowest eigenvalue at one wave with all of its eigenvectors."""
+def _lowest_set(degeneracy: Degeneracy, wave: Wave) -> BlochModes:
+    """The lowest eigenvalue at one wave with all eigenvectors that symmetry adds to the first."""
+    bloch, cell = degeneracy.bloch, degeneracy.cell
     found = bloch.lowest(wave, _MULTIPLICITY, tolerance=_TOLERANCE)
-    cell, values = bloch.cell, found.eigenvalues
+    values = found.eigenvalues
     scale = np.linalg.norm(bloch.state.moduli) / (cell.filling * cell.cell.area)
-    count = int(np.sum(values - values[0] < _DEGENERATE * scale))
+    count = degeneracy.count(found, int(np.sum(values - values[0] < _DEGENERATE * scale)))
     return BlochModes(wave, values[:count], found.vectors[:, :count])
 
 

@@ -117,7 +117,7 @@ class CondensedCell:
 
 
 class LinearisedCell(CondensedCell):
-    """The equations of a cell at a trial state of load [-], F̄ (4,) and w (2 count,) [mm]."""
+    """The equations at a trial state of load [-], F̄ (4,) along its axes, w (2 count,) [mm]."""
 
     def __init__(
         self,
@@ -130,7 +130,8 @@ class LinearisedCell(CondensedCell):
     ) -> None:
         self.loading, self.load, self.amplitude = loading, load, amplitude
         self.gradient, self.fluctuation, self.area = gradient, fluctuation, cell.cell.area
-        super().__init__(cell, cell.affine, cell.displaced(gradient, fluctuation))
+        Q = loading.axes  # along which components are, F̄'s among them
+        super().__init__(cell, cell.affine @ Q, cell.displaced(Q @ gradient, fluctuation))
         if self.is_regular:
             free, self.rate = loading.free, loading.rate
             self.rate[free] = np.linalg.solve(
@@ -182,15 +183,16 @@ class LinearisedCell(CondensedCell):
 
     def state(self) -> CellState:
         """The state reached, with its rates and moduli."""
+        Q = self.loading.axes
         return CellState(
             load=self.load,
-            gradient=self.gradient.reshape(2, 2),
-            gradient_rate=self.rate.reshape(2, 2),
+            gradient=(Q @ self.gradient).reshape(2, 2),
+            gradient_rate=(Q @ self.rate).reshape(2, 2),
             fluctuation=self.fluctuation,
             fluctuation_rate=self.response @ self.rate,
-            stress=np.asarray(self.macro_forces.reshape(2, 2) / self.area),
+            stress=np.asarray((Q @ self.macro_forces).reshape(2, 2) / self.area),
             stiffness=self.stiffness,
-            moduli=self.condensed.reshape(2, 2, 2, 2) / self.area,
+            moduli=(Q @ self.condensed @ Q.T).reshape(2, 2, 2, 2) / self.area,
         )
 
 
@@ -255,7 +257,7 @@ class PeriodicCell:
 
         Where there is none, the reason.
         """
-        F: FloatArray = gradient.ravel()
+        F: FloatArray = loading.axes.T @ gradient.ravel()
         w = fluctuation
         for _ in range(_ITERATIONS):
             F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
@@ -263,7 +265,7 @@ class PeriodicCell:
             if not system.is_regular:
                 return _NOT_CONVERGED
             if system.is_solved:
-                is_sound = self.body.smallest_jacobian(self.displaced(F, w)) > 0
+                is_sound = self.body.smallest_jacobian(self.displaced(loading.axes @ F, w)) > 0
                 return system.state() if is_sound else _REVERSED
             try:
                 change, dF, dw = system.step()
@@ -278,8 +280,8 @@ class PeriodicCell:
         Those of w with F̄ fixed, and of the moduli of the free components (Haynsworth, Linear
         Algebra Appl. 1 (1968) 73-81). Zero: stable against all that has the cell's period.
         """
-        free = loading.free
-        moduli = state.moduli.reshape(4, 4)[np.ix_(free, free)]
+        free, Q = loading.free, loading.axes
+        moduli = (Q.T @ state.moduli.reshape(4, 4) @ Q)[np.ix_(free, free)]
         outer = np.linalg.eigvalsh(0.5 * (moduli + moduli.T))
         return self.factor(state.stiffness).negative_pivots + int(np.sum(outer < 0))
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.periodicity import Periodicity, find_periodicity
+from modeharvest.fem.lattice.symmetry import CellSymmetry, find_symmetry
 from modeharvest.fem.meshing import (
     SIGNS,
     MeshBlock,
@@ -63,6 +64,11 @@ class UnitCell:
         """Which nodes are translates of which."""
         return find_periodicity(self.mesh, self.lattice)
 
+    @cached_property
+    def symmetry(self) -> CellSymmetry:
+        """Of the lattice's geometry, whether the mesh has it or not."""
+        return find_symmetry(self.mesh, self.periodicity)
+
     @property
     def area(self) -> float:
         """Area of the cell, holes included [mm^2]."""
@@ -72,6 +78,8 @@ class UnitCell:
         """The cell of m x n copies along a1 and a2, at least one along either."""
         if m < 1 or n < 1:
             raise InputError(f"enlarged cell: expected at least 1 x 1 copies, got {m} x {n}")
+        if m == n == 1:
+            return self
         # Partners' places agree to rounding first: what passed the check is joined.
         _, first = np.unique(self.periodicity.master, return_index=True)
         nodes = self.mesh.nodes[first[self.periodicity.master]]

@@ -5,6 +5,8 @@ Plain dataclasses, checked where they are built; neither dolfinx nor gmsh is nee
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,11 +28,21 @@ class CriticalSearch:
     """Of each axis of the zone; an even number has the points M and X on the grid."""
     largest_step: float = 0.02
     """Of the load."""
+    waves: tuple[tuple[float, ...], ...] = ()
+    """Phases [π rad] of the only waves to look at, such as [[1, 1]]; none: all there are."""
+    refine: bool = True
+    """Whether the load's error is estimated on the mesh refined once."""
 
     def __post_init__(self) -> None:
+        _ = self.phases
         require_within("search: expected a largest load", self.largest, 0.0, above=True)
         require_within("search: expected divisions", self.divisions, 2, 200)
         require_within("search: expected a largest_step", self.largest_step, SMALLEST_STEP)
+
+    @property
+    def phases(self) -> tuple[Wave, ...]:
+        """The waves in rad."""
+        return tuple(phases_in_rad(wave) for wave in self.waves)
 
 
 Wave = tuple[float, float]
@@ -51,6 +63,12 @@ def wave_of(given: Any) -> Wave:
             f"lattice's plane, got {given}"
         )
     return float(phases[0]), float(phases[1])
+
+
+def phases_in_rad(wave: Sequence[float]) -> Wave:
+    """Units of π to rad; InputError if the wave is not in the plane."""
+    p, q = wave_of(wave)
+    return math.pi * p, math.pi * q
 
 
 def lattice_vectors(given: ArrayLike, what: str) -> FloatArray:
@@ -83,13 +101,15 @@ class MacroLoading:
 
     gradient: Rates
     stress: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
+    angle: float = 0.0
+    """By which the axes of all these components are turned, counter-clockwise from x, y [rad]."""
 
     def __post_init__(self) -> None:
         if not all(len(x) == 2 == len(x[0]) == len(x[1]) for x in (self.gradient, self.stress)):
             got = f"{self.gradient} and {self.stress}"
             raise InputError(f"macroscopic loading: expected two rows of two each, got {got}")
         given = [g for row in self.gradient for g in row if g is not None]
-        if not np.isfinite([*given, *np.ravel(self.stress)]).all():
+        if not np.isfinite([*given, *np.ravel(self.stress), self.angle]).all():
             raise InputError(f"macroscopic loading: expected finite rates, got {self}")
         if self.gradient[0][1] is None and self.gradient[1][0] is None:
             raise InputError(
@@ -100,8 +120,15 @@ class MacroLoading:
             raise InputError(f"macroscopic loading: expected a rate other than 0, got {self}")
 
     @property
+    def axes(self) -> FloatArray:
+        """(4, 4) from components along the turned axes to those along x and y."""
+        c, s = math.cos(self.angle), math.sin(self.angle)
+        turn = np.array([[c, -s], [s, c]])
+        return np.asarray(np.kron(turn, turn))
+
+    @property
     def free(self) -> NDArray[np.bool_]:
-        """(4,) where F̄ (11, 12, 21, 22) is not prescribed but P̄ is."""
+        """(4,) where F̄ (11, 12, 21, 22 along its axes) is not prescribed but P̄ is."""
         return np.array([g is None for row in self.gradient for g in row])
 
     @property

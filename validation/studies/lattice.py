@@ -257,7 +257,7 @@ def _path(lattice: StudiedLattice) -> CellPath:
 
 def kind_of(found: LatticeCritical, largest: float) -> str:
     """What is critical first up to the largest load, as in :class:`ModeRow`."""
-    from modeharvest.fem.bloch.critical import is_same
+    from modeharvest.fem.bloch.degenerate import is_same
 
     if not found.found:
         return "none" if found.load >= largest else "path ends"

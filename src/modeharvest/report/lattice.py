@@ -32,6 +32,7 @@ from modeharvest.report.model import (
     percent,
     text_of,
 )
+from modeharvest.runs.lattice.loads import LoadQuantity
 from modeharvest.runs.lattice.results import (
     DRAWN_AMPLITUDE,
     FoundPattern,
@@ -129,14 +130,19 @@ def proof(critical: Mapping[str, Any]) -> str:
 
 def findings(summary: Summary) -> list[str]:
     """What was found, in sentences."""
-    text, point = [], summary["critical"]
+    text, point, load = [], summary["critical"], LoadQuantity(**summary["load"])
     if point is not None and point["found"]:
-        text.append(text_of("lattice-critical", point=point, load=100 * point["load"],
-                            waves=waves_text(point), proof=proof(point)))  # fmt: skip
+        text.append(text_of("lattice-critical", point=point, load=load,
+                            at=load.text(point["load"], 5), waves=waves_text(point),
+                            proof=proof(point)))  # fmt: skip
+        if point["error"] is not None:
+            error = load.text(point["error"], 2)
+            text.append(text_of("lattice-error", load=load, error=error, order=point["order"]))
     elif point is not None:
         text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
     for part in summary["zone"]:
-        text.append(text_of("lattice-zone", name=wave_name(part["wave"]), **part))
+        at = load.text(part["load"])
+        text.append(text_of("lattice-zone", name=wave_name(part["wave"]), at=at, **part))
     for family in summary["families"]:
         text.append(text_of("lattice-family", count=len(family["waves"]), **family))
     study = summary["study"]
@@ -149,10 +155,11 @@ def findings(summary: Summary) -> list[str]:
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
     """The few numbers at the top."""
-    keys, point = [], summary["critical"]
+    keys, point, load = [], summary["critical"], LoadQuantity(**summary["load"])
     if point is not None:
         names = ["critical-load"] if point["found"] else ["stable-load", "lowest-filling"]
-        keys += [KeyNumber.of(name, load=100 * point["load"], point=point) for name in names]
+        words = {"load": load, "value": load.per_load * point["load"], "point": point}
+        keys += [KeyNumber.of(name, **words) for name in names]
         if point["found"]:
             keys.append(_waves_key(point, summary))
         if point["found"] and point["long_wave_angle"] is None:
@@ -168,7 +175,7 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
     if stable:
         low = min(stable, key=lambda b: _excess(b["states"][-1]))
         name = combination_name(low["combination"])
-        keys.append(KeyNumber.of("stable-branch", name, **low["states"][-1]))
+        keys.append(KeyNumber.of("stable-branch", name, at=load.text(low["states"][-1]["load"])))
     return keys
 
 
@@ -190,9 +197,12 @@ def notes(summary: Summary) -> list[str]:
     """What a reader should know before trusting the numbers, drawn from the data."""
     text, point = [], summary["critical"]
     if point is not None and not point["found"]:
-        text.append(text_of("lattice-no-proof", outcome=summary["outcome"], point=point))
+        load = LoadQuantity(**summary["load"]).text(point["load"])
+        text.append(text_of("lattice-no-proof", outcome=summary["outcome"], point=point, load=load))
     elif point is not None and point["long_wave_angle"] is not None:
         text.append(text_of("lattice-long-waves", loading=point["loading"]))
+    if point is not None and point["splitting"] > 1e-5:
+        text.append(text_of("lattice-splitting", **point))
     if any(branch["states"] for branch in summary["branches"]):
         text.append(text_of("lattice-branches"))
     if summary["study"] is not None:
@@ -270,7 +280,8 @@ def _critical_cards(summary: Summary) -> list[Card]:
     if point is None:
         return []
     mark = Mark("critical", True) if point["found"] else Mark("stable so far", False)
-    row = {"loading": point["loading"], "strain": f"{100 * point['load']:.5g}",
+    load = LoadQuantity(**summary["load"])
+    row = {"loading": point["loading"], "load": load.text(point["load"], 5),
            "waves": waves_text(point), "found": mark, "proof": proof(point)}  # fmt: skip
     return Card.tabular(ReportTable.of("critical", [row]), wide=True)
 
@@ -280,14 +291,15 @@ def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
     if not rows:
         return []
     names = {name: name for name, _ in rows[0]["corners"] if name != "Γ"}
-    loads = [(percent(row["load"]), dict(row["corners"])) for row in rows]
+    load = LoadQuantity(**summary["load"])
+    loads = [(load.text(row["load"]), dict(row["corners"])) for row in rows]
     corners = Card.tabular(ReportTable.of_states("corners", loads, names))
     if run is None or run.dispersion is None:
         return corners
     found, waves = run.dispersion, run.critical.waves if run.critical else ()
-    path = partial(figures.draw_dispersion, found, waves)
+    path = partial(figures.draw_dispersion, found, waves, load)
     maps = [
-        ReportFigure(f"zone-{n}", f"At {100 * part.load:.4g} %",
+        ReportFigure(f"zone-{n}", f"At {load.text(part.load)}",
                      partial(figures.draw_zone_map, part, run.pitch, waves))
         for n, part in enumerate(found.zone, start=1)
     ]  # fmt: skip
@@ -309,15 +321,17 @@ def _mode_section(run: LatticeRun, modes: ModeSet) -> Section:
         ))  # fmt: skip
     many = text_of("lattice-modes", count=len(drawn)) if len(drawn) > 1 else ""
     return Section.of("modes", [Card("Modes", drawn, wide=True)], many=many,
-                      load=percent(modes.load), largest=DRAWN_AMPLITUDE)  # fmt: skip
+                      load=run.load.text(modes.load), largest=DRAWN_AMPLITUDE)  # fmt: skip
 
 
 def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
-    table = ReportTable.of("branches", map(_last_state, summary["branches"]))
+    load = LoadQuantity(**summary["load"])
+    rows = [_last_state(branch, load) for branch in summary["branches"]]
+    table = ReportTable.of("branches", rows)
     return [*(_branch_figures(run) if run else []), *Card.tabular(table, wide=True)]
 
 
-def _last_state(branch: Mapping[str, Any]) -> Mapping[str, Any]:
+def _last_state(branch: Mapping[str, Any], load: LoadQuantity) -> Mapping[str, Any]:
     """A branch's row in the table."""
     named = {"name": combination_name(branch["combination"]), "outcome": branch["outcome"]}
     if not branch["states"]:
@@ -326,7 +340,7 @@ def _last_state(branch: Mapping[str, Any]) -> Mapping[str, Any]:
     sizes = np.array(state["amplitudes"])
     sizes = np.where(np.abs(sizes) > 1e-6 * np.abs(sizes).max(), sizes, 0.0)
     amplitudes = ", ".join(number(float(a)) for a in sizes)
-    shown = {"strain": f"{100 * state['load']:.4g}", "excess": _excess(state)}
+    shown = {"at": load.text(state["load"]), "excess": _excess(state)}
     return {**state, **named, **shown, "amplitudes": amplitudes}
 
 
@@ -336,11 +350,11 @@ def _branch_figures(run: LatticeRun) -> list[Card]:
         return []
     critical = run.modes.load
     drawn = {
-        "energies": partial(figures.draw_energies, followed, critical),
-        "amplitudes": partial(figures.draw_amplitudes, followed, critical),
+        "energies": partial(figures.draw_energies, followed, critical, run.load),
+        "amplitudes": partial(figures.draw_amplitudes, followed, critical, run.load),
     }
     if len(followed) > 1:
-        drawn["differences"] = partial(figures.draw_differences, followed)
+        drawn["differences"] = partial(figures.draw_differences, followed, run.load)
     return [Card.captioned(name, draw) for name, draw in drawn.items()]
 
 

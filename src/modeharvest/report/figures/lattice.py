@@ -24,6 +24,7 @@ from modeharvest.report.figures import curves, style
 from modeharvest.report.figures.boundaries import LatticePatch, MeshBoundary
 from modeharvest.report.figures.maps import WIDTH, ColourScale, bare_axes, colour_bar, shaded
 from modeharvest.report.figures.style import BLUE, COLOURS, DENSITY, INK, MUTED, RED
+from modeharvest.runs.lattice.loads import STRAIN, LoadQuantity
 from modeharvest.runs.lattice.results import combination_name
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.lattice import ModeRow
@@ -127,7 +128,9 @@ def _window_axes(
     return drawn, axes
 
 
-def draw_dispersion(dispersion: Dispersion, critical: Sequence[Wave] = ()) -> Figure:
+def draw_dispersion(
+    dispersion: Dispersion, critical: Sequence[Wave] = (), load: LoadQuantity = STRAIN
+) -> Figure:
     """Draw the lowest eigenvalue along a path through the zone, at several loads.
 
     ``dispersion``: eigenvalues; higher bands are drawn faintly. ``critical``: phases (k . a1, k .
@@ -144,7 +147,7 @@ def draw_dispersion(dispersion: Dispersion, critical: Sequence[Wave] = ()) -> Fi
     colours = _LOADS(np.linspace(0.0, 1.0, max(2, len(order))))
     for k, colour in zip(order, colours, strict=False):
         axes.plot(distances, values[k, :, 1:], color=colour, lw=0.7, alpha=0.35)
-        name = f"{100 * dispersion.loads[k]:.3g} %"
+        name = load.text(float(dispersion.loads[k]), 3)
         axes.plot(distances, values[k, :, 0], color=colour, lw=1.6, label=name)
     for x in distances[_on_path(dispersion.waves, critical)]:
         curves.ring(axes, x, 0.0)
@@ -253,28 +256,32 @@ def _turns(critical: Sequence[Wave]) -> FloatArray:
     return np.asarray(np.vstack([phases, -phases]) / (2.0 * np.pi), dtype=np.float64)
 
 
-def draw_energies(branches: Sequence[Branch], critical: float | None) -> Figure:
+def draw_energies(
+    branches: Sequence[Branch], critical: float | None, load: LoadQuantity = STRAIN
+) -> Figure:
     """Draw each branch's energy over that of the primary path at the same load.
 
     ``branches``: those with states. ``critical``: critical load [-].
     """
-    return _branches(branches, critical, "energy − primary path's [kPa]", _excess, zero=True)
+    return _branches(branches, critical, load, "energy − primary path's [kPa]", _excess, zero=True)
 
 
-def draw_amplitudes(branches: Sequence[Branch], critical: float | None) -> Figure:
+def draw_amplitudes(
+    branches: Sequence[Branch], critical: float | None, load: LoadQuantity = STRAIN
+) -> Figure:
     """Draw the size of the critical modes' amplitudes along each branch."""
-    drawn = _branches(branches, critical, "amplitude, rms over the material [mm]", _size)
+    drawn = _branches(branches, critical, load, "amplitude, rms over the material [mm]", _size)
     axes = drawn.axes[0]
     for line, branch in zip(axes.lines[::3], (b for b in branches if b.states), strict=False):
         kept = [(size, s.load) for size, s in zip(_size(branch), branch.states, strict=True)]
         points = np.vstack([branch.curve, kept])  # the branch is passed in finer steps
         points = points[np.argsort(points[:, 0])]
         points = points[points[:, 0] <= max(kept)[0]]
-        line.set_data(100.0 * points[:, 1], points[:, 0])
+        line.set_data(load.per_load * points[:, 1], points[:, 0])
     return drawn
 
 
-def draw_differences(branches: Sequence[Branch]) -> Figure:
+def draw_differences(branches: Sequence[Branch], load: LoadQuantity = STRAIN) -> Figure:
     """Draw each branch's energy over that of the lowest branch at the same load."""
     lowest: dict[float, float] = {}
     for state in (s for branch in branches for s in branch.states):
@@ -283,7 +290,7 @@ def draw_differences(branches: Sequence[Branch]) -> Figure:
     def above(branch: Branch) -> list[float]:
         return [1e6 * (s.energy - lowest[s.load]) for s in branch.states]
 
-    return _branches(branches, None, "energy − lowest branch's [Pa]", above, zero=True)
+    return _branches(branches, None, load, "energy − lowest branch's [Pa]", above, zero=True)
 
 
 def _excess(branch: Branch) -> list[float]:
@@ -297,26 +304,27 @@ def _size(branch: Branch) -> list[float]:
 def _branches(
     branches: Sequence[Branch],
     critical: float | None,
+    quantity: LoadQuantity,
     label: str,
     value: Callable[[Branch], list[float]],
     zero: bool = False,
 ) -> Figure:
-    drawn, axes = curves.curve("load: nominal strain [%]", label)
+    drawn, axes = curves.curve(quantity.axis, label)
     if zero:
         axes.axhline(0.0, color=MUTED, lw=0.9)
     for n, branch in enumerate(b for b in branches if b.states):
-        load = 100.0 * np.array([s.load for s in branch.states])
+        load = quantity.per_load * np.array([s.load for s in branch.states])
         stable = np.array([s.negative_eigenvalues == 0 for s in branch.states])
         heights, colour = np.array(value(branch)), COLOURS[n % len(COLOURS)]
         name = combination_name(branch.combination)
         name += "" if stable.all() else ", unstable" if not stable.any() else ", partly stable"
-        start = [] if critical is None else [100.0 * critical]
+        start = [] if critical is None else [quantity.per_load * critical]
         axes.plot([*start, *load], [*np.zeros(len(start)), *heights], color=colour, lw=1.5,
                   ls="-" if stable.all() else curves.DASHES, label=name)  # fmt: skip
         axes.plot(load[stable], heights[stable], "o", color=colour, ms=3.5)
         axes.plot(load[~stable], heights[~stable], "o", color=colour, ms=3.5, mfc="none")
     if critical is not None:
-        curves.ring(axes, 100.0 * critical, 0.0)
+        curves.ring(axes, quantity.per_load * critical, 0.0)
     curves.legend_above(axes)
     return drawn
 

@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from pydantic import model_validator
@@ -31,6 +31,7 @@ from modeharvest.fem.lattice import options
 from modeharvest.fem.lattice.options import CriticalSearch, Wave
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
+from modeharvest.runs.lattice.loads import Loading
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.studies.lattice import (
@@ -144,11 +145,14 @@ class FileLattice:
     """Largest edge length [mm] where a geometry is meshed; None for a mesh."""
     unit: str | None = None
     """Of the file's own lengths, "m" or "um" for instance; None: mm, and asked for if unlikely."""
+    primitive: bool = True
+    """Of a supercell its primitive cell, which waves and modes then refer to; false: as it is."""
     symmetry = "oblique"
 
     def cell(self) -> UnitCell:
-        """The cell as the file has it."""
+        """The cell as the file has it, or its primitive one."""
         from modeharvest.fem.lattice.files import read_cell
+        from modeharvest.fem.lattice.primitive import primitive_cell
 
         cell = read_cell(self.path, self.vectors, self.mesh_size, self.unit)
         shortest = float(np.linalg.norm(cell.lattice, axis=1).min())
@@ -157,74 +161,13 @@ class FileLattice:
                 f"{self.path}: expected the pitch l in mm, about the distance of the holes in a "
                 f"cell whose shorter vector is {shortest:.4g} mm long, got {self.pitch}"
             )
-        return cell
+        return primitive_cell(cell) if self.primitive else cell
 
 
 LATTICES: dict[str, type[Any]] = {
     "square": SquareLattice, "hexagonal": HexagonalLattice, "tetrachiral": TetrachiralLattice,
     "hexachiral": HexachiralLattice, "file": FileLattice,
 }  # fmt: skip
-
-Component = float | Literal["free"]
-_ZERO = ((0.0, 0.0), (0.0, 0.0))
-
-
-@dataclass(frozen=True)
-class Loading:
-    """How the lattice is loaded; the load e multiplies all rates."""
-
-    kind: Literal["uniaxial", "uniaxial-strain", "equibiaxial", "shear", "prescribed"] = "uniaxial"
-    """Compression by the nominal strain e: "uniaxial" (lateral side free), "uniaxial-strain" (no
-    lateral strain) or "equibiaxial". "shear": planes y = const slide along x by e. Or "prescribed":
-    the rates below."""
-    axis: Literal["x", "y"] = "x"
-    """Either "x" or "y", of the first two kinds."""
-    gradient: tuple[tuple[Component, Component], tuple[Component, Component]] | None = None
-    """dF̄/de, row by row [-], "free" where the mean stress is prescribed; of "prescribed" only."""
-    stress: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """dP̄/de [MPa] where the gradient is free; of "prescribed" only."""
-
-    def __post_init__(self) -> None:
-        if self.kind == "prescribed" and self.gradient is None:
-            example = '[[-1.0, 0.0], [0.0, "free"]]'
-            raise InputError(
-                f'loading: expected the gradient of "prescribed", such as {example}, got none'
-            )
-        if self.kind != "prescribed" and (self.gradient or self.stress):
-            raise InputError(
-                f'loading: expected gradient and stress with kind = "prescribed", got {self.kind!r}'
-            )
-        self.macro()
-
-    def macro(self) -> options.MacroLoading:
-        """What the equilibrium equations need."""
-        if self.gradient is not None:
-            (a, b), (c, d) = self.gradient
-            rates = (_rate(a), _rate(b)), (_rate(c), _rate(d))
-            return options.MacroLoading(rates, self.stress or _ZERO)
-        axis = "xy".index(self.axis)
-        return {
-            "uniaxial": options.uniaxial(axis),
-            "uniaxial-strain": options.uniaxial_strain(axis),
-            "equibiaxial": options.equibiaxial(),
-            "shear": options.simple_shear(),
-        }[self.kind]
-
-    @property
-    def name(self) -> str:
-        """In words, for tables and pictures."""
-        words = self.kind.replace("-", " ")
-        return f"{words} along {self.axis}" if self.kind.startswith("uniaxial") else words
-
-    @property
-    def is_isotropic(self) -> bool:
-        """Whether the lattice keeps its rotational symmetry."""
-        (a, b), (c, d) = self.macro().gradient
-        return a is not None and a == d and b == 0 == c
-
-
-def _rate(component: Component) -> float | None:
-    return None if component == "free" else float(component)
 
 
 @dataclass(frozen=True)
@@ -234,7 +177,7 @@ class DispersionPlan:
     loads: tuple[float, ...] = ()
     """[-]; none: 0, half the critical load and the critical one."""
     points: int = 60
-    """Wave vectors along the path."""
+    """Wave vectors along the path; 0: no dispersion."""
     bands: int = 3
     """Eigenvalues at each of them."""
     map_divisions: int = 24
@@ -246,6 +189,8 @@ class DispersionPlan:
     def __post_init__(self) -> None:
         _check_loads("dispersion", self.loads)
         tour = self._own_tour()
+        if not self.points:
+            return
         if tour and not 2 <= len(tour) <= self.points:
             raise InputError(
                 "dispersion: expected two corners or more, and no fewer points, got "
@@ -268,7 +213,7 @@ class DispersionPlan:
         return ZONES["rhombic" if lattice.symmetry == "hexagonal" else "oblique"]
 
     def _own_tour(self) -> tuple[tuple[str, Wave], ...]:
-        return tuple((name, _phases(wave)) for name, wave in self.corners)
+        return tuple((name, options.phases_in_rad(wave)) for name, wave in self.corners)
 
 
 @dataclass(frozen=True)
@@ -282,8 +227,8 @@ class ModesPlan:
     another load than the critical one have no branches."""
     combinations: tuple[tuple[float, ...], ...] = ()
     """One row of coefficients for each branch to follow, as many as there are modes, in the order
-    of their waves (critical ones by phases, the largest first); none: each mode alone, and the sum
-    of all."""
+    of their waves (critical ones by phases, the largest first); none: all that no symmetry makes
+    equal, ``fem.bloch.degenerate.distinct_combinations``."""
     branch_loads: tuple[float, ...] = ()
     """At which states of the branches are kept [-]; none: 1.02, 1.1, 1.25 and 1.5 times the
     critical load."""
@@ -298,13 +243,7 @@ class ModesPlan:
     @property
     def phases(self) -> tuple[Wave, ...]:
         """The waves in rad."""
-        return tuple(_phases(wave) for wave in self.waves)
-
-
-def _phases(wave: Sequence[float]) -> Wave:
-    """Units of π to rad; InputError if the wave is not in the plane."""
-    p, q = options.wave_of(wave)
-    return math.pi * p, math.pi * q
+        return tuple(options.phases_in_rad(wave) for wave in self.waves)
 
 
 def _check_loads(where: str, loads: Sequence[float]) -> None:

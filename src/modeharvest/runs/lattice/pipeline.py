@@ -56,10 +56,12 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         def work() -> tuple[Path, ...]:
             primary = self._path()
             from modeharvest.fem.bloch.critical import first_critical
+            from modeharvest.fem.bloch.mesh_error import load_error
 
-            progress = named(self.progress, "first critical load")
-            found = first_critical(primary, self.case.search, progress)
-            point = CriticalPoint.of(self.case.loading.name, found)
+            progress, search = named(self.progress, "first critical load"), self.case.search
+            found = first_critical(primary, search, progress)
+            error = load_error(found, primary, self.case.material, search)
+            point = CriticalPoint.of(self.case.loading.name, found, error)
             write_json(path, to_plain({"point": point, "history": found.history}))
             return (path,)
 
@@ -168,7 +170,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         Raises InputError if another process works in the folder.
         """
         with exclusive(self.folder):
-            self.dispersion()
+            self._search()
             return self.report()
 
     def all(self) -> dict[str, Any]:
@@ -178,7 +180,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         there is is reported before.
         """
         with exclusive(self.folder):
-            self.dispersion()
+            self._search()
             try:
                 self.families()
                 self.study()
@@ -188,6 +190,13 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             return self.report()
 
     # -- parts --------------------------------------------------------------------------
+
+    def _search(self) -> None:
+        """The critical point, and the dispersion if it is wanted."""
+        if self.case.dispersion.points:
+            self.dispersion()
+        else:
+            self.critical()
 
     def _info(self, critical: CriticalPoint) -> dict[str, Any]:
         """What a mode's user must know of where it comes from."""
@@ -250,13 +259,14 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
     def _branches(self, modes: ModeSet) -> list[Branch]:
         """A branch for each combination of modes, on their commensurate cell."""
+        from modeharvest.fem.bloch.degenerate import distinct_combinations
         from modeharvest.fem.bloch.postbuckling import follow
         from modeharvest.fem.lattice.cell import PeriodicCell
 
         plan = self.case.modes
-        combinations = plan.combinations or default_combinations(len(modes.waves))
         loads = plan.branch_loads or tuple(factor * modes.load for factor in BEYOND)
         cell = PeriodicCell(self._unit.enlarged(*modes.info["copies"]), self.case.material)
+        combinations = plan.combinations or distinct_combinations(cell, modes)
         found = []
         for k, combination in enumerate(combinations, start=1):
             listener = named(self.progress, f"branch {k} of {len(combinations)}")
@@ -272,13 +282,14 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         if modes is not None:
             found += [PeriodicField.of_mode(modes, k, info) for k in range(len(modes.waves))]
             found += [
-                PeriodicField.of_branch(modes, k, branch, info)
+                PeriodicField.of_branch(modes, k, branch, info, self.case.loading.quantity)
                 for k, branch in enumerate(branches, start=1) if branch.states
             ]  # fmt: skip
         load = self.case.modes.load or critical.load
         path = self._path(load)
         state = _state(path, load)
-        return [*found, PeriodicField.of_primary(path.cell, state, load, modes, info)]
+        quantity = self.case.loading.quantity
+        return [*found, PeriodicField.of_primary(path.cell, state, load, modes, info, quantity)]
 
     def _shown(self, modes: ModeSet) -> list[FoundPattern]:
         """Branches from the lowest energy up, or else modes; and the primary path."""
@@ -293,8 +304,10 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
     def _run(self, done: Collection[str]) -> LatticeRun:
         """All there is, for the report."""
         from modeharvest.fem import dolfinx_api
+        from modeharvest.fem.bloch.mesh_error import ligament_notes
 
         unit, critical = self._unit, self.critical()
+        why_no_modes = self._why_no_modes(critical)
         modes, branches = self.modes() if "modes" in done else (None, ())
         command = "modes" if "families" in done else "bloch"
         return LatticeRun(
@@ -304,6 +317,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             mesh=unit.mesh,
             lattice=unit.lattice,
             pitch=self.case.lattice.pitch,
+            load=self.case.loading.quantity,
             critical=critical,
             dispersion=self.dispersion() if "dispersion" in done else None,
             modes=modes,
@@ -311,7 +325,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             patterns=self._shown(modes) if modes and "families" in done else (),
             study=self.case.run_study(self.folder / "study.csv", self.progress)
             if "study" in done else None,  # of which the rows are all there
-            notes=[*unit.notes, *filter(None, [self._why_no_modes(critical)])],
+            notes=[*unit.notes, *ligament_notes(unit), *filter(None, [why_no_modes])],
             exports=results.exports_in(self.folder),
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
         )  # fmt: skip
@@ -331,12 +345,6 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             "families": digest([critical, content["modes"], "families"]),
             "study": stage_key([tables, content["study"]]),
         }
-
-
-def default_combinations(count: int) -> tuple[tuple[float, ...], ...]:
-    """Each of some modes alone, and the sum of all where there are more."""
-    alone = [tuple(float(i == k) for i in range(count)) for k in range(count)]
-    return (*alone, (1.0,) * count) if count > 1 else tuple(alone)
 
 
 def _state(path: CellPath, load: float) -> CellState:

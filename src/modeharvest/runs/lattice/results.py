@@ -24,6 +24,7 @@ from modeharvest.idic.spectra.mode_family import (
     read_family,
     read_spectrum,
 )
+from modeharvest.runs.lattice.loads import STRAIN, LoadQuantity
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_csv
@@ -70,16 +71,25 @@ class CriticalPoint:
     """Lowest filling · λ / k² at ``load`` [MPa]."""
     angle: float | None = None
     """Direction of long waves [rad], None for others."""
+    splitting: float = 0.0
+    splitting_bound: float = 0.0
+    """By how much the mesh splits a degenerate set: ``LatticeCritical`` [-]."""
+    error: float | None = None
+    order: float | None = None
+    """What the mesh makes the load too high by, about, and the order of convergence assumed [-]."""
 
     @classmethod
-    def of(cls, loading: str, found: LatticeCritical) -> CriticalPoint:
+    def of(
+        cls, loading: str, found: LatticeCritical, error: tuple[float, float] | None = None
+    ) -> CriticalPoint:
         """A search's result, waves by phases, the largest first: rounding must not number them."""
         every = zip(found.waves, found.below, found.above, strict=True)
         ordered = sorted(every, key=lambda one: [-round(phase, 3) for phase in one[0]])
         waves, below, above = zip(*ordered, strict=True) if ordered else ((), (), ())
         least = found.least_stable
         return cls(loading, found.load, found.found, found.outcome, waves, below, above,
-                   found.unstable_before, least.value, least.angle)  # fmt: skip
+                   found.unstable_before, least.value, least.angle,
+                   found.splitting, found.splitting_bound, *(error or ()))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,13 +129,14 @@ class PeriodicField:
 
     @classmethod
     def of_branch(
-        cls, modes: ModeSet, k: int, branch: Branch, info: Mapping[str, Any]
-    ) -> PeriodicField:
+        cls, modes: ModeSet, k: int, branch: Branch, info: Mapping[str, Any],
+        load: LoadQuantity = STRAIN,
+    ) -> PeriodicField:  # fmt: skip
         """The last state of branch k (from 1)."""
         last = branch.states[-1]
         return cls(
             file=f"family_branch_{k}.json",
-            name=f"{combination_name(branch.combination)} at {100 * last.load:.4g} %",
+            name=f"{combination_name(branch.combination)} at {load.text(last.load)}",
             mesh=modes.mesh,
             lattice=modes.lattice,
             displacement=last.displacement,
@@ -143,6 +154,7 @@ class PeriodicField:
         load: float,
         modes: ModeSet | None,
         info: Mapping[str, Any],
+        quantity: LoadQuantity = STRAIN,
     ) -> PeriodicField:
         """The unbuckled lattice at a load, on the modes' cell where there is one."""
         unit, gradient = cell.cell, state.gradient - np.eye(2)
@@ -152,7 +164,7 @@ class PeriodicField:
         same = cKDTree(known, boxsize=1.0).query(wanted)[1]
         return cls(
             file="family_primary.json",
-            name=f"primary path at {100 * load:.4g} %",
+            name=f"primary path at {quantity.text(load)}",
             mesh=mesh,
             lattice=lattice,
             displacement=w[same] + mesh.nodes @ gradient.T,
@@ -217,6 +229,8 @@ class LatticeRun:
     """The primitive cell [mm] and its (2, 2) lattice vectors as rows [mm]."""
     pitch: float
     """Unit cell size l [mm]."""
+    load: LoadQuantity = STRAIN
+    """What the load parameter stands for."""
     critical: CriticalPoint | None = None
     dispersion: Dispersion | None = None
     modes: ModeSet | None = None
@@ -239,6 +253,9 @@ _EXPORTS = {
     "modes.xdmf": "the same as XDMF",
     "study.csv": "every lattice of the study",
 }
+_CRITICAL = (
+    "loading found load waves value below above earlier splitting splitting_bound error order"
+)
 _FAMILY = "mode family and Fourier coefficients"
 _PEAKS = 8
 
@@ -258,13 +275,15 @@ def summary_of(run: LatticeRun, families: Sequence[FoundPattern]) -> dict[str, A
         "title": run.title,
         "case": dict(run.case),
         "outcome": critical.outcome if critical else "",
+        "load": to_plain(run.load),
         "critical": critical and {
-            **to_plain(picked(critical, "loading found load waves value below above earlier")),
+            **to_plain(picked(critical, _CRITICAL)),
             "long_wave_angle": critical.angle,
         },
         **_eigenvalues(run.dispersion),
         "modes": modes and {
-            **to_plain(picked(modes, "load waves eigenvalues")), "copies": modes.info["copies"]
+            **to_plain(picked(modes, "load waves primitive eigenvalues")),
+            "copies": modes.info["copies"],
         },
         "branches": [_branch(branch) for branch in run.branches],
         "families": [_family(found) for found in families],

@@ -1,0 +1,101 @@
+"""How good a cell's mesh is: elements across its ligaments, and the error of a critical load.
+
+That error is estimated from the same point on a mesh refined once, every element divided into four
+along its own curved coordinates. Of the outline, which stays as it is, nothing is learnt so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from modeharvest.fem.bloch.critical import LatticeCritical, critical_at
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.lattice.options import CriticalSearch
+from modeharvest.fem.lattice.symmetry import Outline
+from modeharvest.fem.materials import Material
+from modeharvest.fem.meshing import MeshBlock, join
+from modeharvest.util.arrays import FloatArray
+
+SMOOTH, NOTCHED = 2.0, 1.0
+"""Orders of convergence that critical loads have at least, by what the holes' edges are: between
+2.6 and 3.6 is observed for round holes (docs/bloch.md); notches make strains singular."""
+_NOTCH = 0.35  # rad: a kink that makes a notch
+ENOUGH = 3
+"""Elements across a ligament."""
+_CHILDREN = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
+_REFERENCE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])
+
+
+def load_error(
+    found: LatticeCritical, path: CellPath, material: Material, search: CriticalSearch
+) -> tuple[float, float] | None:
+    """The critical load's error by one refinement [-], and the order p assumed.
+
+    None where there is no such load, or the search is not to ``refine``.
+
+    By Richardson's extrapolation it is the change of the load times 2^p / (2^p - 1), of which the
+    sign is kept: what the load is too high by. As p is assumed, at its lowest, it is a bound
+    rather than a correction.
+    """
+    if not (found.found and search.refine):
+        return None
+    cell = path.cell.cell
+    order = NOTCHED if Outline(cell.mesh, cell.periodicity).sharpest > _NOTCH else SMOOTH
+    shortest = float(np.linalg.norm(cell.lattice, axis=1).min())
+    finer = UnitCell(refined(cell.mesh, 1e-7 * shortest), cell.lattice)
+    nested = CellPath(PeriodicCell(finer, material), path.loading)
+    wave = found.least_stable.wave if found.least_stable.angle is None else None
+    again = critical_at(nested, wave, search)
+    if not again.found:
+        return None
+    return (found.load - again.load) * 2.0**order / (2.0**order - 1.0), order
+
+
+def refined(mesh: Mesh, tolerance: float) -> Mesh:
+    """A T6 mesh with every element divided into four; nodes nearer than that [mm] become one."""
+    blocks = []
+    for child in _CHILDREN:
+        corners = _REFERENCE[list(child)]
+        places = np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])
+        x, y = places.T
+        L = np.stack([1.0 - x - y, x, y], axis=1)
+        N = np.hstack([L * (2.0 * L - 1.0), 4.0 * L * np.roll(L, -1, axis=1)])
+        nodes = np.einsum("kn,end->ekd", N, mesh.nodes[mesh.cells])
+        blocks.append(MeshBlock(nodes.reshape(-1, 2), np.arange(6 * len(nodes)).reshape(-1, 6)))
+    return join(blocks, tolerance)
+
+
+def elements_across(cell: UnitCell) -> tuple[int, FloatArray]:
+    """Fewest elements between two holes, copies included, and where [mm].
+
+    From each hole on layers of elements are counted; holes meet where a side joins two nodes that
+    are nearer to different ones. A hole's own arms, around a ligament that ends, are not looked at.
+    """
+    p, outline = cell.periodicity, Outline(cell.mesh, cell.periodicity)
+    sides = np.concatenate([cell.mesh.cells[:, [k, (k + 1) % 3]] for k in range(3)])
+    sides = np.concatenate([sides, sides[:, ::-1]])
+    (a, b), step = p.master[sides].T, p.shift[sides[:, 1]] - p.shift[sides[:, 0]]
+    hole, copy = np.full(p.count, -1), np.zeros((p.count, 2), dtype=np.int64)
+    hole[outline.masters], copy[outline.masters] = outline.hole, outline.copy
+    layer = np.where(hole < 0, -1, 0)
+    while True:
+        reached = np.flatnonzero((layer[a] == layer.max()) & (layer[b] < 0))
+        if not len(reached):
+            break
+        hole[b[reached]], copy[b[reached]] = hole[a[reached]], copy[a[reached]] - step[reached]
+        layer[b[reached]] = layer.max() + 1
+    meet = np.flatnonzero((hole[a] != hole[b]) | np.any(copy[a] - step != copy[b], axis=1))
+    if not len(meet):
+        return len(cell.mesh.cells), cell.mesh.nodes[0]
+    across = layer[a[meet]] + layer[b[meet]] + 1
+    least = int(np.argmin(across))
+    return int(across[least]), cell.mesh.nodes[sides[meet[least]]].mean(axis=0)
+
+
+def ligament_notes(cell: UnitCell) -> list[str]:
+    """A warning where there are few elements across a ligament."""
+    count, (x, y) = elements_across(cell)
+    few = f"only {count} element{'s' * (count > 1)} across the ligament at ({x:.4g}, {y:.4g}) mm"
+    return [] if count >= ENOUGH else [f"{few}: take {ENOUGH} or more, bending is too stiff so"]
