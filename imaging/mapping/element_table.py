@@ -14,7 +14,7 @@ from modeharvest.imaging.mapping.bernstein import (
     sub_elements,
     to_bernstein,
 )
-from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled, in_parallel
 from modeharvest.util.elements import ReferenceElement, monomial_gradients, reference_element
 
@@ -24,6 +24,7 @@ CLEAR_OF_EDGES = 1e-6
 """In xi, eta; pixels on an edge come out within some 1e-9."""
 UNASSIGNED, EDGE, INSIDE, OVERLAPPING, EXCLUDED = 0, 1, 2, 3, 4
 """States of a pixel: not assigned yet, on an element's edge, inside it, inside two; left out."""
+_AFFINE_PX = 1e-13  # terms of higher degree that add up to less are rounding
 
 
 class ElementTable(NamedTuple):
@@ -38,6 +39,8 @@ class ElementTable(NamedTuple):
     to the centre [px]."""
     centres: FloatArray
     """(m, 2) whole pixels."""
+    affine: BoolArray
+    """(m,) whether the polynomials have no terms of higher than the first degree."""
     row_from: IntArray
     row_to: IntArray
     """(m,) the image rows row_from ... row_to - 1 may hold pixels of it."""
@@ -86,7 +89,7 @@ def tabulate_elements(
     slopes = np.stack([_enlarged_slopes(reference, beyond) for beyond in BEYOND])
     elements = ElementTable(
         np.empty((count, 2, 9)), np.empty((count, 2, 9)), np.empty((count, sides, 2, 3)),
-        np.empty((count, 2)), np.empty(count, dtype=np.int64),
+        np.empty((count, 2)), np.empty(count, dtype=np.bool_), np.empty(count, dtype=np.int64),
         np.empty(count, dtype=np.int64), np.ascontiguousarray(reference.nodes[:sides]),
         bezier_matrix(triangular), slopes, sub_elements(triangular),
         reference.middle, triangular,
@@ -144,6 +147,7 @@ def _tabulate(
             c = elements.sides[e, side, 0]
             low = min(low, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
             high = max(high, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
+        elements.affine[e] = np.abs(elements.polynomials[e, :, 3:]).sum() <= _AFFINE_PX
         elements.row_from[e] = min(max(int(np.ceil(low - 1e-9 + centre[0])), 0), rows)
         elements.row_to[e] = min(max(int(np.floor(high + 1e-9 + centre[0])) + 1, 0), rows)
 

@@ -84,6 +84,7 @@ def outside(triangular: bool, s: float, t: float) -> float:
 def invert(
     polynomial: FloatArray,
     triangular: bool,
+    affine: bool,
     row: FloatArray,
     col: FloatArray,
     s: FloatArray,
@@ -93,7 +94,7 @@ def invert(
     """Solve position(s, t) = (row, col) for ``count`` pixels from s, t; it may be wrong."""
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
     curved = not triangular
-    for _ in range(_BATCH_STEPS):
+    for _ in range(1 if affine else _BATCH_STEPS):
         total = 0.0  # of squared residuals before the step
         for k in range(count):
             p, p_s, p_t = value_and_slopes(a, curved, s[k], t[k])
@@ -201,6 +202,8 @@ End = tuple[float, float, float]
 
 _CLOSE_PX = 1e-6  # rows that miss a side or a corner by less meet it; pixels are looked at anyway
 _CLOSE = 1e-6  # the same along a side
+_FLAT_PX = 1e-3  # straight sides that are lower: a row that misses their end by rounding is near
+_FAR_PX = 1e9
 
 
 @compiled(inline=True, relaxed=True)
@@ -222,6 +225,23 @@ def ends(sides: FloatArray, corners: FloatArray, row: float) -> tuple[End, End]:
             low, low_at = col if lower else low, side + at if lower else low_at
             high, high_at = col if higher else high, side + at if higher else high_at
     return _end(corners, low, low_at), _end(corners, high, high_at)
+
+
+@compiled(inline=True, relaxed=True)
+def straight_ends(sides: FloatArray, row: float) -> tuple[End, End]:
+    """Where a row meets an element whose sides are straight: between the lines that these lie on.
+
+    Only the columns are given. The row is one of the element's own, so that sides along it, which
+    say nothing about columns, needn't be looked at.
+    """
+    low, high = -_FAR_PX, _FAR_PX
+    for side in range(sides.shape[0]):
+        down = sides[side, 0, 1]
+        if abs(down) > _FLAT_PX:
+            col = sides[side, 1, 0] + (row - sides[side, 0, 0]) * (sides[side, 1, 1] / down)
+            # Nodes are counter-clockwise: the left side leads down.
+            low, high = max(low, col if down > 0.0 else low), min(high, high if down > 0.0 else col)
+    return (low, 0.0, 0.0), (high, 0.0, 0.0)
 
 
 @compiled(inline=True, relaxed=True)

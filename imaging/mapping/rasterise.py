@@ -37,6 +37,7 @@ from modeharvest.imaging.mapping.inversion import (
     outside,
     search,
     start_cubic,
+    straight_ends,
     value,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
@@ -101,90 +102,59 @@ def fill(
 ) -> int:
     """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many lie in two elements.
 
-    ``selected`` (n,) tells of a whole image's pixels where to look; everywhere if it is empty.
+    That is counted with residuals alone. ``selected`` (n,) tells of a whole image's pixels where to
+    look; everywhere if it is empty.
     """
     begin, end = (top - pixels.first_row) * pixels.cols, (bottom - pixels.first_row) * pixels.cols
     state = np.zeros(end - begin, dtype=np.uint8)
     pixels.element[begin:end] = -1
     if selected.size:
-        of_rows = selected[top * pixels.cols : bottom * pixels.cols]
-        for k in range(of_rows.size):
-            state[k] = UNASSIGNED if of_rows[k] else EXCLUDED
+        for k, is_selected in enumerate(selected[top * pixels.cols : bottom * pixels.cols]):
+            state[k] = UNASSIGNED if is_selected else EXCLUDED
     real = np.empty((6, _BATCH))
     batch = Batch(real[0], real[1], real[2], real[3], real[4], real[5],
                   np.empty(_BATCH, dtype=np.int64))  # fmt: skip
-    for e in visited:
-        first, last = max(top, elements.row_from[e]), min(bottom, elements.row_to[e])
-        _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
-    return _mark_background(pixels.element, pixels.values, pixels.residual, state, begin)
-
-
-@compiled()
-def _mark_background(
-    element: NDArray[np.int32],
-    values: FloatArray,
-    residual: NDArray[np.float32],
-    state: NDArray[np.uint8],
-    begin: int,
-) -> int:
-    """Mark what is unassigned as background; count what lies in two elements."""
-    overlapping = 0
-    for k in range(state.size):
-        overlapping += state[k] == OVERLAPPING
-    if residual.size:  # else these pixels are on their way elsewhere
-        for k in range(state.size):
-            if element[begin + k] < 0:
-                residual[begin + k] = np.nan
-                for field in range(values.shape[0]):
-                    values[field, begin + k] = np.nan
-    return overlapping
-
-
-@compiled(inline=True)
-def _fill_element(
-    elements: ElementTable,
-    fields: FloatArray,
-    pixels: Pixels,
-    e: int,
-    first: int,
-    last: int,
-    state: NDArray[np.uint8],
-    begin: int,
-    batch: Batch,
-) -> None:
-    """Assign the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
-    centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
-    polynomial, sides, corners = elements.polynomials[e], elements.sides[e], elements.corners
-    curved, cols, first_row = not elements.triangular, pixels.cols, pixels.first_row
     rows_, cols_, s, t, where = batch.row, batch.col, batch.s, batch.t, batch.where
-    count = 0
-    for image_row in range(first, last):
-        row = float(image_row - centre_row)
-        low, high = ends(sides, corners, row)
-        if not low[0] <= high[0]:
-            continue
-        col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
-        past = min(cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
-        at = (image_row - first_row) * cols
-        while col < past and state[at + col - begin] == EXCLUDED:
-            col += 1
-        while col < past and state[at + past - 1 - begin] == EXCLUDED:
-            past -= 1
-        while col < past:
-            if count == _BATCH:
-                _assign(elements, fields, pixels, e, state, begin, batch, count)
-                count = 0
-            stop = min(past, col + _BATCH - count)
-            n, col_from = stop - col, float(col - centre_col)
-            start_cubic(polynomial, curved, low, high, col_from, s[count : count + n],
-                        t[count : count + n])  # fmt: skip
-            for k in range(n):
-                rows_[count + k] = row
-                cols_[count + k] = col_from + k
-                where[count + k] = at + col + k
-            count += n
-            col = stop
-    _assign(elements, fields, pixels, e, state, begin, batch, count)
+    cols, first_row, corners = pixels.cols, pixels.first_row, elements.corners
+    # Here and not in a kernel of its own, which would count references to all arrays each time.
+    for e in visited:
+        centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
+        polynomial, sides, affine = elements.polynomials[e], elements.sides[e], elements.affine[e]
+        count = 0
+        for image_row in range(max(top, elements.row_from[e]), min(bottom, elements.row_to[e])):
+            row = float(image_row - centre_row)
+            low, high = straight_ends(sides, row) if affine else ends(sides, corners, row)
+            if not low[0] <= high[0] + _MARGIN_PX:
+                continue
+            col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
+            past = min(cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
+            at = (image_row - first_row) * cols
+            while col < past and state[at + col - begin] == EXCLUDED:
+                col += 1
+            while col < past and state[at + past - 1 - begin] == EXCLUDED:
+                past -= 1
+            while col < past:
+                if count == _BATCH:
+                    _assign(elements, fields, pixels, e, state, begin, batch, count)
+                    count = 0
+                stop = min(past, col + _BATCH - count)
+                n, col_from = stop - col, float(col - centre_col)
+                for k in range(count, count + n):
+                    rows_[k], cols_[k], where[k] = row, col_from + (k - count), at + col + k - count
+                    s[k] = t[k] = 0.0  # from where Newton's method solves an affine map at once
+                if not affine:
+                    start_cubic(polynomial, not elements.triangular, low, high, col_from,
+                                s[count : count + n], t[count : count + n])  # fmt: skip
+                count, col = count + n, stop
+        _assign(elements, fields, pixels, e, state, begin, batch, count)
+    overlapping = 0
+    if pixels.residual.size:  # else these pixels are on their way elsewhere
+        for k in range(state.size):
+            overlapping += state[k] == OVERLAPPING
+            if pixels.element[begin + k] < 0:
+                pixels.residual[begin + k] = np.nan
+                pixels.values[:, begin + k] = np.nan
+    return overlapping
 
 
 @compiled(inline=True)
@@ -202,9 +172,9 @@ def _assign(
     polynomial, triangular = elements.polynomials[e], elements.triangular
     row, col, s, t, off, residual, where = batch
     element, residuals = pixels.element, pixels.residual
-    invert(polynomial, triangular, row, col, s, t, count)
+    invert(polynomial, triangular, elements.affine[e], row, col, s, t, count)
     _check(elements, pixels, e, row, col, s, t, off, residual, count)
-    reach = np.nan  # it is proved when first needed
+    reach = np.inf if elements.affine[e] else np.nan  # it is proved when first needed
     assigned = 0
     for k in range(count):
         depth = -outside(triangular, s[k], t[k])
