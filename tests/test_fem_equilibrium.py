@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
-from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.meshing import REVERSED_T6, mesh_specimen
 from modeharvest.fem.path.continuation import PathFollower, State, displacement_at
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.newton import STRAIN_TOLERANCE, correct
@@ -249,6 +249,30 @@ def test_reaction_is_the_slope_of_the_energy(edges: str) -> None:
     )
     rate = (high.u - low.u) * (0.5 / h)
     assert (rate - mid.tangent).norm() < 1e-5 * mid.tangent.norm()
+
+
+def test_where_no_node_is_at_mid_height_sliding_edges_are_held_by_the_nearest() -> None:
+    """An even number of staggered rows: the specimen and its mirror image behave alike.
+
+    In both the upper one of the two nearest nodes is held; it is not the same one of the specimen.
+    """
+    specimen = Specimen(3, 4, bulk_x=0.9, bulk_y=0.3, stacking="triangular")
+    mesh = mesh_specimen(specimen, 0.45)
+    on_edge = mesh.nodes[mesh.nodes[:, 0] < 1e-9 - specimen.half_size[0], 1]
+    assert np.abs(on_edge).min() > 0.05
+    turned = Mesh(mesh.nodes * [1.0, -1.0], mesh.cells[:, REVERSED_T6], mesh.element)
+    loading = EdgeCompression(specimen.half_size[0], specimen.length, "sliding")
+    found = []
+    for body in (mesh, turned):
+        structure = Structure(body, Ogden(), loading)
+        u = structure.nodal(equilibrium(structure, 0.02).u)
+        left = np.abs(body.nodes[:, 0] + specimen.half_size[0]) < 1e-9
+        held = left & (np.abs(u[:, 1]) < 1e-14)
+        assert body.nodes[held, 1] == pytest.approx([np.abs(on_edge).min()])
+        found.append(u)
+    apart = found[0] - found[1] * [1.0, -1.0]
+    np.testing.assert_allclose(apart - apart[0], 0.0, atol=1e-9)  # but for a translation
+    assert abs(apart[0, 1]) > 1e-4
 
 
 def test_nodal_values_come_in_the_order_of_the_mesh() -> None:

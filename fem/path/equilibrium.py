@@ -33,7 +33,7 @@ class EdgeCompression:
     """The length that nominal strain refers to [mm]; e * length is the shortening."""
     edges: str = "clamped"
     """With "clamped", both components are prescribed; with "sliding", u_y is free on the loaded
-    edges but for one node at mid-height, which keeps the specimen in place."""
+    edges but for the node nearest to mid-height, which keeps the specimen in place."""
     tilt: float = 0.0
     """Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal strain
     [rad]: -e tilt y is added to its u_x."""
@@ -74,16 +74,15 @@ class Structure:
         half, tolerance = loading.half_width, 1e-8 * loading.half_width
         on_edge = np.abs(np.abs(x[:, 0]) - half) < tolerance
         fixed_y = on_edge.copy()
-        if loading.edges != "clamped":
-            fixed_y = (np.abs(x[:, 0] + half) < tolerance) & (np.abs(x[:, 1]) < tolerance)
+        if loading.edges != "clamped":  # of two nodes as far from mid-height, the upper one
+            off = np.hypot(x[:, 0] + half, x[:, 1] - tolerance)
+            least = self.comm.allreduce(float(off.min(initial=np.inf)), MPI.MIN)
+            fixed_y = on_edge & (off < least + 0.5 * tolerance)
         for pin in loading.pins:
             fixed_y |= np.hypot(x[:, 0] - pin[0], x[:, 1] - pin[1]) < tolerance
         along, across = np.flatnonzero(on_edge), np.flatnonzero(fixed_y)
-        if self.comm.allreduce(len(along)) == 0 or self.comm.allreduce(len(across)) == 0:
-            raise InputError(
-                f"loading: expected nodes on the edges x = +-{half} mm (and one at mid-height for "
-                "sliding edges), found none"
-            )
+        if self.comm.allreduce(len(along)) == 0:
+            raise InputError(f"loading: expected nodes on the edges x = +-{half} mm, found none")
         target = self._direction.x.array.reshape(-1, 2)
         target[along, 0] = -0.5 * loading.length * np.sign(x[along, 0])
         self._shortening = self._direction.x.array.copy()
