@@ -153,17 +153,23 @@ def square_family(origin: str = "junction") -> ModeFamily:
 
 
 def rotation_family(specimen: Specimen) -> ModeFamily:
-    """Eq. (mode) on a specimen with rows that aren't staggered, its origin at a solid junction.
-
-    With rows at another distance than the holes in them, the waves start with the lattice's own
-    lengths, and a1 with the ratio of amplitudes by which junctions turn without changing shape.
-    """
-    (a, b), ratio = specimen.cellular_half_size, specimen.pitch / specimen.row_distance
+    """:func:`turning_family` of a specimen with rows that aren't staggered."""
+    a, b = specimen.cellular_half_size
     x0 = 0.0 if specimen.holes_x % 2 == 0 else a % specimen.pitch
     y0 = 0.0 if specimen.holes_y % 2 == 0 else b % specimen.row_distance
-    family = square_family("junction")
-    start = family.start * [1.0 / ratio, 1.0, ratio, 1.0, ratio, 1.0, 1.0]
-    return replace(family, start=start).moved((x0, y0))
+    return turning_family(specimen.vectors, specimen.pitch, (x0, y0))
+
+
+def turning_family(vectors: FloatArray, cell_size: float, junction: ArrayLike) -> ModeFamily:
+    """Eq. (mode) on a lattice of right angles, ``vectors`` (2, 2) as rows, about a junction [mm].
+
+    The waves start with the lattice's own lengths, in units of pi over the cell size [mm], and a1
+    with the ratio of amplitudes by which junctions turn without changing shape.
+    """
+    first, second = np.linalg.inv(vectors / cell_size).T
+    along, across = np.linalg.norm(vectors, axis=1)
+    start = np.array([across / along, *(first + second), *(second - first), 0.0, 0.0])
+    return replace(square_family("junction"), start=start).moved(junction)
 
 
 T2 = -0.45

@@ -16,8 +16,15 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion, outline_motion, robust_fit
-from modeharvest.idic.photograph.initial_guess import InitialGuess, hole_centres, initial_guess
-from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.idic.modes import FourierMode
+from modeharvest.idic.photograph.geometry import Geometry, SpecimenTable, find_geometry
+from modeharvest.idic.photograph.initial_guess import (
+    InitialGuess,
+    chosen_modes,
+    hole_centres,
+    initial_guess,
+)
+from modeharvest.idic.setup import PhotographOptions, SquareLatticeOptions
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE
 from modeharvest.imaging.grid import PixelGrid
@@ -276,3 +283,41 @@ def test_stray_values_hardly_move_a_robust_fit() -> None:
     assert fit.outliers == 30
     # A median of which 15 % are strays is the good ones' 59th percentile: 1.22 times the sd.
     assert fit.sd == pytest.approx(0.0122, rel=0.2)
+
+
+def chosen(vectors: np.ndarray, how: PhotographOptions) -> tuple[Geometry, FourierMode]:
+    """The mode of a field without a pattern, on a plate with holes of 1.4 mm."""
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    holes = ~holes_mask(GRID, vectors, 0.7, vectors.sum(axis=0) / 2)
+    mask = ~(holes & Box.centred(4 * 1.9, 6 * vectors[1, 1]).contains(x, y))
+    geometry = find_geometry(mask, GRID, SpecimenTable(1.9), Path())
+    field = sampled_field(patterned(GRID, amplitude=0.0), GRID, mask, 2)
+    boxes = list(geometry.parts.values())
+    guess = from_field(field, boxes, lattice=geometry.lattice_mm, options=how)
+    ansatz, unknowns = chosen_modes(guess, geometry, 1.9, how)
+    assert unknowns.size == ansatz.size
+    (mode,) = ansatz.modes
+    return geometry, mode
+
+
+@pytest.mark.parametrize("height", [1.9, 2.4])
+@pytest.mark.parametrize("how", [{"family": "square"}, {"fixed_mode": False}])
+def test_eq_mode_starts_on_the_lattice_of_the_holes(height: float, how: dict[str, object]) -> None:
+    geometry, mode = chosen(np.diag([1.9, height]), PhotographOptions(**how))
+    assert mode.family.size == (7 if "fixed_mode" in how else 0)  # none is observable
+    rows = mode.family.waves(mode.family.start)
+    expected = [[-height / 1.9, 1, 1, 1.9 / height], [-height / 1.9, -1, -1, 1.9 / height]]
+    np.testing.assert_allclose(rows[:, :4], expected, rtol=1e-3)
+    # Holes turn about their centres, neighbours in opposite senses.
+    lattice = geometry.lattice
+    assert lattice is not None
+    x, y = GRID.to_mm(*lattice.centres.T)
+    phase = np.pi / 1.9 * (np.outer(rows[:, 2], x) + np.outer(rows[:, 3], y) + rows[:, 4:])
+    assert np.abs(np.sin(phase)).max() < 0.5 * np.pi * GRID.pixel_size / 1.9  # half a pixel
+
+
+def test_eq_mode_is_refused_on_staggered_holes() -> None:
+    vectors = 1.9 * np.array([[1.0, 0.0], [0.5, np.sqrt(0.75)]])
+    for how in (PhotographOptions(family="square"), PhotographOptions(fixed_mode=False)):
+        with pytest.raises(InputError, match=r"rectangular lattice.*got hexagonal lattice; set"):
+            chosen(vectors, how)

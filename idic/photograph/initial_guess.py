@@ -33,7 +33,7 @@ from modeharvest.idic.local.motion import (
     first_motion,
     fit_unknowns,
 )
-from modeharvest.idic.modes import ModeFamily, Taper, free_family, square_family
+from modeharvest.idic.modes import ModeFamily, Taper, free_family, turning_family
 from modeharvest.idic.photograph.geometry import Geometry, box_of, junction
 from modeharvest.idic.photograph.holes import find_holes
 from modeharvest.idic.setup import PhotographOptions
@@ -119,7 +119,8 @@ def initial_guess(
                 "with an amplitude of its own."
             )
     if not modes and cells.square:
-        modes = [(fixed_square(cells), box) for box in boxes]
+        fixed = turning_family(cells.vectors, cell_size, cells.junction).fixed()
+        modes = [(fixed, box) for box in boxes]
         text.append(
             "The mode is fixed at the square pattern that the lattice of holes allows: without a "
             "pattern, its parameters aren't observable."
@@ -279,13 +280,6 @@ def _free_mode(waves: list[PlaneWave]) -> ModeFamily:
     return free_family(rows)
 
 
-def fixed_square(cells: Cells) -> ModeFamily:
-    """The square pattern that the holes allow, without parameters: for images that show none."""
-    first, second = cells.cell_size * np.linalg.inv(cells.vectors).T
-    start = np.array([1.0, *(first + second), *(second - first), 0.0, 0.0])
-    return replace(square_family(), start=start).moved(cells.junction).fixed()
-
-
 def _fitted(ansatz: Ansatz, local: LocalField) -> RobustFit:
     """v0 and every v_i through the field; a mode that isn't observable isn't fitted."""
     a, slow = ansatz.initial_guess(), min(SLOW_DEGREE, ansatz.v0_degree)
@@ -301,22 +295,24 @@ def chosen_modes(
 ) -> tuple[Ansatz, FloatArray]:
     """The guess's ansatz and unknowns with the specified family, its modes fixed or not."""
     ansatz, unknowns = guess.ansatz, guess.unknowns
-    wants_square = how.family == "square" and geometry.lattice is not None
-    if (wants_square and "square" not in guess.family) or (
-        ansatz.fixed and how.fixed_mode is False
-    ):
-        if geometry.lattice is None:
+    lattice = geometry.lattice
+    wants_square = how.family == "square" and lattice is not None and "square" not in guess.family
+    if wants_square or (ansatz.fixed and how.fixed_mode is False):
+        if lattice is None or lattice.kind not in ("square", "rectangular"):
             raise InputError(
-                "correlation: expected fixed_mode true or 'auto' where no pattern and no lattice "
-                "of holes are found, got false"
+                "correlation: expected holes on a square or rectangular lattice, for Eq. (mode) to "
+                f"start from, got {'no' if lattice is None else lattice.kind} lattice; set family "
+                "and fixed_mode to 'auto'"
             )
-        family = square_family("junction").moved(junction(geometry.lattice, geometry.grid))
+        vectors = _matching_vectors(cell_size, geometry.lattice_mm)
+        family = turning_family(vectors, cell_size, junction(lattice, geometry.grid))
         families = [(family, box) for box in geometry.parts.values()]
         v0 = unknowns[: 2 * ansatz.v0_space.size]
         ansatz = replace(ansatz, modes=Ansatz.on(ansatz.domain, families, cell_size).modes)
         unknowns = ansatz.initial_guess()
         unknowns[: v0.size] = v0
-    if how.fixed_mode is True and not ansatz.fixed:
+    keep = guess.ansatz.fixed if how.fixed_mode == "auto" else how.fixed_mode
+    if keep and not ansatz.fixed:
         return with_fixed_modes(ansatz, unknowns)
     return ansatz, unknowns
 
