@@ -169,7 +169,7 @@ class Sensor:
 
     def illumination(self, name: str) -> float:
         """Factor on an image's irradiance, 1 on average, by its name in its set."""
-        draw = _stream(self.flicker_seed, "flicker", name).standard_normal()
+        draw = stream(self.flicker_seed, "flicker", name).standard_normal()
         return float(np.exp(self.flicker * draw))
 
     def mean(self, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -183,15 +183,19 @@ class Sensor:
 
         The noise follows from the seeds and the image's ``name``: no two images of a set share it.
         """
+        return quantise(np.minimum(self.noisy(irradiance, name), self.saturation), bits)
+
+    def noisy(self, irradiance: NDArray[np.float32], name: str) -> NDArray[np.floating]:
+        """Grey levels with noise, before cut-off and rounding [fraction of full scale]."""
         grey: NDArray[np.floating] = self.mean(irradiance)
         if self.full_well > 0.0:
             electrons = self.full_well * np.maximum(irradiance.astype(np.float64), 0.0)
-            shots = _stream(self.shot_seed, "shot", name).poisson(electrons)
+            shots = stream(self.shot_seed, "shot", name).poisson(electrons)
             grey = self.gain * shots / self.full_well + self.offset
         if self.read_noise > 0.0:
-            draw = _stream(self.read_seed, "read", name)
+            draw = stream(self.read_seed, "read", name)
             grey = grey + self.read_noise * draw.standard_normal(grey.shape)
-        return quantise(np.minimum(grey, self.saturation), bits)
+        return grey
 
     def noise_variance(self, grey: ArrayLike, bits: int) -> FloatArray:
         """Predicted variance of a camera's grey level of that mean, both as fractions.
@@ -214,5 +218,6 @@ class Sensor:
         return int(np.count_nonzero(levels >= top))
 
 
-def _stream(seed: int, kind: str, name: str) -> np.random.Generator:
+def stream(seed: int, kind: str, name: str) -> np.random.Generator:
+    """Random numbers of a kind of noise in the image of that name."""
     return np.random.default_rng([seed, zlib.crc32(f"{kind} noise of {name}".encode())])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from modeharvest.fem import materials
@@ -38,9 +39,26 @@ def test_a_material(monkeypatch: pytest.MonkeyPatch) -> None:
                 ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering(P[i, j])
             )
             assert float(applied) == pytest.approx(0.0)
+    P, tangent = materials.stress_and_tangent(made, np.eye(2)[None])
+    assert np.abs(P).max() < 1e-15
+    assert tangent[0, 0, 1, 0, 1] == pytest.approx(made.mu)
+    assert materials.material_of(materials.material_table(made)) == made
     assert materials.material_table(made) == {"kind": "NeoHookean", "mu": 0.5, "kappa": 5.4}
 
 
 def test_a_number_in_the_report() -> None:
     names = run("A number in the report of a virtual experiment")
     assert list(quantities(names["Snapshot"])) == [("w, largest", "px", "largest_w_px")]
+
+
+def test_a_noise_of_the_sensor() -> None:
+    made = run("A noise of the sensor")["Sensor"]
+    camera = made(full_well=5000.0, dark_electrons=2000.0, gain=0.8, shot_seed=1)
+    light = np.full((300, 300), 0.5, dtype=np.float32)
+    grey = camera.expose(light, 16, "one") / (2**16 - 1)
+    # Of 90 000 numbers the variance scatters by sqrt(2 / 90 000) = 0.5 %.
+    assert grey.var() == pytest.approx(float(camera.noise_variance(0.4, 16)), rel=0.02)
+    assert grey.mean() == pytest.approx(0.4, abs=1e-3)
+    assert np.array_equal(camera.expose(light, 16, "one") / (2**16 - 1), grey)
+    assert not np.array_equal(camera.expose(light, 16, "two") / (2**16 - 1), grey)
+    assert grey.var() > 1.5 * float(made(full_well=5000.0, gain=0.8).noise_variance(0.4, 16))

@@ -23,7 +23,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.fem.materials import Material, Ogden, TwoTermI1, stress_and_tangent
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.errors import InputError
@@ -222,6 +222,8 @@ def test_recipe_of_the_documentation_works() -> None:
     np.testing.assert_allclose(stress, 0.0, atol=1e-14)
     assert tangent[0, 1, 0, 1] == pytest.approx(material.mu)
     assert tangent[0, 0, 1, 1] == pytest.approx(material.lam)
+    by_jets = stress_and_tangent(material, EYE[None])
+    np.testing.assert_allclose(by_jets[1][0], tangent, atol=1e-14)
     solution = simulate(Experiment(Specimen(1, 1), material, strains=(0.05,), mesh_size=0.5))
     assert solution.info["outcome"] == "complete"
     assert solution.info["material"] == {"kind": "NeoHooke", "mu": 0.6, "lam": 5.4}
