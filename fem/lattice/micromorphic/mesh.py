@@ -94,7 +94,11 @@ def specimen_mesh(
     divisions : of the cellular part along x and y; by default one for two holes, at least two.
     quarter : only that with x, y >= 0, of half the divisions (rounded up).
     """
-    half, whole = specimen.cellular_half_size, specimen.half_size
+    whole, edges = specimen.half_size, np.array([specimen.bulk_x, specimen.bulk_y])
+    # Next to solid edges of staggered rows as much is lattice as their holes' cells fill.
+    cells = specimen.row_counts.mean(), specimen.holes_y
+    filled = 0.5 * np.array(cells) * (specimen.pitch, specimen.row_distance)
+    half = np.where(edges > 0.0, filled, specimen.cellular_half_size)
     counts = divisions or [max(2, round(0.5 * n)) for n in (specimen.holes_x, specimen.holes_y)]
     if min(counts) < 1:
         raise InputError(f"macroscopic mesh: expected divisions of 1 or more, got {divisions}")
