@@ -96,6 +96,19 @@ def test_errors_of_waves_and_phases_are_snapped_away(
     np.testing.assert_allclose(np.linalg.norm(found.measured.vectors, axis=1), k)
 
 
+def test_snapping_is_measured_in_standard_deviations() -> None:
+    specimen = Specimen(6, 10)
+    (mode,) = Ansatz.of_specimen(specimen).modes
+    off = mode.family.start + np.array([0, 0.01, 0, 0, -0.02, 0, 0])
+    found = LatticeMode.of(mode, off, specimen, cell_vectors(specimen))
+    errors = np.diag([1.0, 0.005, 0.1, 0.1, 0.004, 1.0, 1.0]) ** 2
+    assert found.deviation(mode, errors) == pytest.approx(5.0)
+    errors[1, 2] = errors[2, 1] = 0.8 * 0.005 * 0.1  # what goes with kx's error is no excuse
+    assert found.deviation(mode, errors) == pytest.approx(5.0)
+    errors[4, 4] = 1.0
+    assert found.deviation(mode, errors) == pytest.approx(2.0 / 0.6)
+
+
 def test_a_wave_of_another_lattice_is_refused() -> None:
     specimen = Specimen(6, 10)
     (mode,) = Ansatz.of_specimen(specimen).modes

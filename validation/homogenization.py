@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from modeharvest.fem.field import Solution
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, snapped
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.modes import FourierMode
+from modeharvest.idic.modes import PER_WAVE, FourierMode
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
@@ -127,6 +127,16 @@ class LatticeMode:
         pairs = [(getattr(self.snapped, n), getattr(waves, n)) for n in ("cosine", "sine")]
         a, b = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
         return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
+
+    def deviation(self, mode: FourierMode, covariance: FloatArray) -> float:
+        """By how many standard deviations snapping changes a wave vector, at most of all [-].
+
+        ``mode``: that was measured, ``covariance`` (m, m): of its parameters.
+        """
+        slopes = mode.family.matrix.reshape(self.measured.vectors.shape[0], PER_WAVE, -1)[:, 2:4]
+        change = (self.snapped.vectors - self.measured.vectors) * mode.half_wavelength / np.pi
+        inverse = np.linalg.pinv(slopes @ covariance @ slopes.swapaxes(1, 2), hermitian=True)
+        return float(np.sqrt(np.einsum("wi,wij,wj->w", change, inverse, change)).max())
 
     def is_same(self, other: LatticeMode) -> bool:
         """Whether snapping has made one pattern of both."""

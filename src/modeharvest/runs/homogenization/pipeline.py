@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.micromorphic.branches import Homogenized
     from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
 
+_FAR = 3.0
+"""Standard deviations by which snapping may change a wave vector without a warning."""
 _SAME = 0.01
 """By how much a cell of the same lattice may differ in its vectors and its solid share."""
 _CRITICAL = "load kind negative_before negative_after"
@@ -306,7 +308,25 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                 raise
             raise InputError(f"mode: expected an image of the buckled specimen, got one in which "
                              f"{seen.warnings[lost[0]]}; {error}") from error  # fmt: skip
-        return found, parameters, seen.warnings
+        return found, parameters, (*seen.warnings, *self._far_waves(found, parameters))
+
+    def _far_waves(
+        self, found: Sequence[LatticeMode], parameters: ModeParameters
+    ) -> tuple[str, ...]:
+        """A warning for each mode that snapping changed by more than its error bars."""
+        assert self.result is not None
+        warnings, first = list[str](), 0
+        for k, mode in zip(self._numbers, found, strict=True):
+            own = self.result.ansatz.modes[k]
+            part = slice(first, first := first + own.family.size)
+            off = mode.deviation(own, parameters.covariance[part, part])
+            if parameters.by_model_error is not None and off > _FAR:
+                warnings.append(
+                    f"phi{k + 1}: snapping to the lattice changed a wave vector by "
+                    f"{mode.wave_change.max():.2%}, {off:.1f} of its standard deviations: is this "
+                    "mode of this lattice?"
+                )
+        return tuple(warnings)
 
     @property
     def _pair(self) -> ImagePair | None:
