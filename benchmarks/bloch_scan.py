@@ -22,8 +22,11 @@ import numpy as np
 from refinement import refined_cell
 
 from modeharvest.fem.bloch.critical import critical_at, first_critical
+from modeharvest.fem.bloch.degenerate import distinct_combinations
 from modeharvest.fem.bloch.dispersion import ZONES, zone_path
 from modeharvest.fem.bloch.eigen import BlochWaves, scan
+from modeharvest.fem.bloch.postbuckling import follow
+from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.lattice.bloch_map import factorise
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
@@ -140,8 +143,11 @@ def rates(count: int) -> None:
     print(f"| {families[0][0]} | compressible | equibiaxial | {values}", flush=True)
 
 
-def splitting() -> None:
-    """By how much gmsh's mesh of a rhombus splits the three M points of hexagonal stacking."""
+def splitting(size: float) -> None:
+    """By how much gmsh's mesh of a rhombus splits the three M points of hexagonal stacking.
+
+    And which branches start at the critical load of the first one.
+    """
     vectors = np.array([[1.0, 0.0], [0.5, 0.75**0.5]])
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
@@ -152,10 +158,17 @@ def splitting() -> None:
     holes = [occ.addDisk(*(r @ vectors), 0.0, 0.45, 0.45) for r in ([0, 0], [0, 1], [1, 0], [1, 1])]
     occ.cut([(2, plate)], [(2, hole) for hole in holes])
     occ.synchronize()
-    cell = cell_from_gmsh(vectors, 0.1)
+    cell = cell_from_gmsh(vectors, size)
     gmsh.finalize()
-    found = first_critical(CellPath(PeriodicCell(cell, TwoTermI1()), equibiaxial()))
-    print(f"{found.outcome}: split by {found.splitting:.3%}, bound {found.splitting_bound:.3%}")
+    path = CellPath(PeriodicCell(cell, TwoTermI1()), equibiaxial())
+    found = first_critical(path)
+    print(f"size {size}: {found.outcome}", end="; ")
+    print(f"split by {found.splitting:.3%}, bound {found.splitting_bound:.3%}")
+    modes = real_modes(path.cell, found.state, found.waves)
+    copies = PeriodicCell(cell.enlarged(2, 2), TwoTermI1())
+    for row in distinct_combinations(copies, modes):
+        branch = follow(CellPath(copies, equibiaxial()), modes, row, [1.2 * modes.load])
+        print(f"    {row}: {branch.outcome}", flush=True)
 
 
 def study() -> None:
@@ -186,7 +199,8 @@ def main() -> None:
     elif asked.what == "rates":
         rates(asked.meshes)
     elif asked.what == "splitting":
-        splitting()
+        for size in (0.1, 0.06):
+            splitting(size)
     else:
         study()
 

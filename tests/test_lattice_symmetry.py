@@ -93,6 +93,7 @@ def test_the_primitive_cell_of_copies_is_part_of_their_mesh(m: int, n: int, tmp_
     assert f"holds {m * n} primitive ones" in cell.notes[-1]
     as_it_is = FileLattice(str(tmp_path / "cell.vtu"), 1.0, vectors, primitive=False).cell()
     assert len(as_it_is.mesh.cells) == m * n * len(cell.mesh.cells)
+    assert f"holds {m * n} primitive ones" in as_it_is.notes[-1]
     same = [path_of(c, equibiaxial()).at(0.005) for c in (cell, HEXAGONAL)]
     assert np.allclose(same[0].moduli, same[1].moduli, rtol=1e-9)  # type: ignore[union-attr]
 

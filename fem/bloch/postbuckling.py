@@ -29,7 +29,7 @@ from modeharvest.util.progress import Progress, silent
 _FIRST, _LONGEST, _FARTHEST = 0.01, 0.02, 0.4
 _GROWTH = 1.6  # of the step from one point to the next
 _BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
-_CRITICAL = 1e-3  # of the eigenvalues' scale: what a critical mode may have
+_CRITICAL = 1e-2  # of the eigenvalues' scale: what a mode of a set that the mesh splits may have
 _NEAR = 0.5  # of a step: how far from where it is expected a point may be
 _REFINEMENTS = 6
 

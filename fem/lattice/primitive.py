@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -15,8 +17,8 @@ from modeharvest.util.errors import InputError
 _SAME = 3e-6  # shares of lattice vectors
 
 
-def primitive_cell(cell: UnitCell) -> UnitCell:
-    """The primitive cell of a lattice, with a note; the same cell if it is one.
+def primitive_cell(cell: UnitCell, wanted: bool = True) -> UnitCell:
+    """The primitive cell of a lattice, with a note; the same cell if it is one, or not ``wanted``.
 
     Its elements and nodes are the mesh's own. An InputError refuses a supercell that is meshed
     differently from one primitive cell to the next. That is not good enough for stability: what
@@ -27,6 +29,11 @@ def primitive_cell(cell: UnitCell) -> UnitCell:
     if count == 1:
         return cell
     text = f"[{', '.join(f'[{x:.9g}, {y:.9g}]' for x, y in vectors)}]"
+    if not wanted:
+        note = (
+            f"the cell holds {count} primitive ones, vectors = {text} mm: modes may mix their waves"
+        )
+        return replace(cell, notes=(*cell.notes, note))
     if not _is_uniform(cell):
         raise InputError(
             f"expected a primitive cell, or copies of one, got a supercell of {count} that are "
@@ -38,7 +45,7 @@ def primitive_cell(cell: UnitCell) -> UnitCell:
     used, cells = np.unique(cell.mesh.cells[chosen], return_inverse=True)
     mesh = Mesh(cell.mesh.nodes[used], cells.reshape(-1, 6).astype(np.int64), "T6")
     note = f"the given cell holds {count} primitive ones, of which one is analysed, vectors = "
-    note += f"{text} mm: waves are phases along these, so what the given cell has at Γ is resolved"
+    note += f"{text} mm: waves are phases along these"
     origin = None if cell.origin is None else cell.origin[used]
     return UnitCell(mesh, vectors, origin, (*cell.notes, note))
 

@@ -161,7 +161,7 @@ class FileLattice:
                 f"{self.path}: expected the pitch l in mm, about the distance of the holes in a "
                 f"cell whose shorter vector is {shortest:.4g} mm long, got {self.pitch}"
             )
-        return primitive_cell(cell) if self.primitive else cell
+        return primitive_cell(cell, self.primitive)
 
 
 LATTICES: dict[str, type[Any]] = {
