@@ -12,7 +12,9 @@ from modeharvest.fem.bloch.critical import LatticeCritical, critical_at
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.lattice.foreign import NODES
 from modeharvest.fem.lattice.options import CriticalSearch
+from modeharvest.fem.lattice.periodicity import PARTS
 from modeharvest.fem.lattice.symmetry import Outline
 from modeharvest.fem.materials import Material
 from modeharvest.fem.meshing import MeshBlock, join
@@ -24,8 +26,6 @@ SMOOTH, NOTCHED = 2.0, 1.0
 _NOTCH = 0.35  # rad: a kink that makes a notch
 ENOUGH = 3
 """Elements across a ligament."""
-_CHILDREN = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
-_REFERENCE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])
 
 
 def load_error(
@@ -56,8 +56,7 @@ def load_error(
 def refined(mesh: Mesh, tolerance: float) -> Mesh:
     """A T6 mesh with every element divided into four; nodes nearer than that [mm] become one."""
     blocks = []
-    for child in _CHILDREN:
-        corners = _REFERENCE[list(child)]
+    for corners in np.array(NODES)[PARTS]:
         places = np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])
         x, y = places.T
         L = np.stack([1.0 - x - y, x, y], axis=1)

@@ -183,6 +183,6 @@ def _gradients(xi: float, eta: float) -> FloatArray:
     return np.stack([by_xi, by_eta], axis=1)
 
 
-# At the element's own nodes, which determine a Jacobian that is quadratic.
-_NODES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
-_GRADIENTS = np.array([_gradients(xi, eta) for xi, eta in _NODES])
+NODES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
+"""Of a T6 element, in its own coordinates; values there determine a Jacobian that is quadratic."""
+_GRADIENTS = np.array([_gradients(xi, eta) for xi, eta in NODES])

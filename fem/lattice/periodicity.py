@@ -173,8 +173,8 @@ def _named(numbers: IntArray, nodes: FloatArray) -> str:
     return f"{len(numbers)} nodes: {', '.join(places)}{more}"
 
 
-# A T6 as four triangles with straight sides.
-_PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+# A T6 as four triangles.
+PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 _DEPTH = 1e-3  # of a triangle's height: what doesn't count as overlap
 
 
@@ -187,7 +187,7 @@ def overlaps(
     displacement is (n, 2) of the nodes [mm].
     """
     nodes, vectors = mesh.nodes + displacement, lattice @ gradient.T
-    triangles = nodes[mesh.cells[:, _PARTS].reshape(-1, 3)]
+    triangles = nodes[mesh.cells[:, PARTS].reshape(-1, 3)]
     points = nodes[np.unique(boundary_sides(mesh))]
     images = [points + np.array(r) @ vectors for r in product((-1, 0, 1), repeat=2)]
     return bool(_inside(np.vstack(images), triangles, _DEPTH).any())
