@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import meshio
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.io import loadmat
 
 from modeharvest.cli.root import main
 from modeharvest.fem.lattice.micromorphic.patterns import rotation_pattern
@@ -277,6 +279,7 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     assert summary["mode"]["errors"] == "model error"
     assert "phi1 is not observable" in summary["warnings"][0], "four holes are few"
     assert {s["negative_eigenvalues"] for s in summary["states"]} == {0}
+    require_exported(out, summary)
     # The same mode from its file: without the images it was measured in, and their strain.
     result = out / "experiment/correlation/result_1300.json"
     one = SMALL.replace('"measured"', f'"file"\npath = "{result}"')
@@ -312,6 +315,38 @@ def test_positions_are_spread_evenly_over_a_cell(
         assert np.abs(mean) == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
+def require_exported(out: Path, summary: dict[str, Any]) -> None:
+    """The RVE's file has the specimen's states and the mode with its error bars."""
+    with h5py.File(out / "rve.h5") as rve, h5py.File(out / "homogenized.h5") as fields:
+        loads, places = rve["states/loads"][:], rve["states/points"][:]
+        wanted = [s["nominal_strain"] for s in summary["states"]]
+        before = [e for e in np.unique(loads) if e not in wanted]
+        assert before == pytest.approx([summary["critical_strain"]], abs=1e-4)
+        for k, strain in enumerate(wanted):
+            here = np.isclose(loads, strain)
+            np.testing.assert_array_equal(places[here], fields["points"][:])
+            assert set(rve["states/buckled"][:][here]) == {k == 1}
+            for name in ("strains", "stresses"):
+                # The specimen's are linearised from a state that is 1e-7 off.
+                near = fields[f"states/{k:03d}/{name}"][:]
+                np.testing.assert_allclose(rve[f"states/{name}"][:][here], near, atol=1e-7)
+        # No pattern yet; near the critical point rounding grows.
+        assert np.abs(rve["states/strains"][:, 4][loads < min(before) + 1e-9]).max() < 1e-6
+        assert set(rve["states/negative_eigenvalues"]) == {0}
+        known, mode = read_json(out / "mode.json")["parameters"], rve["waves/0"]
+        measured = rve["measured"]
+        np.testing.assert_array_equal(measured["parameters"], known["values"])
+        np.testing.assert_array_equal(measured["by_model_error"], known["by_model_error"])
+        assert list(measured["parameters"].attrs["names"]) == known["names"]
+        assert list(measured["parameters"].attrs["units"]) == known["units"]
+        assert np.trace(mode["covariance"]) > 0
+        change = np.linalg.norm(mode["vectors"][:] - mode["measured/vectors"], axis=1)
+        k = np.linalg.norm(mode["measured/vectors"], axis=1)
+        np.testing.assert_allclose(change / k, summary["mode"]["wave_change"])
+    assert loadmat(out / "rve.mat")["RVEmesh"]["nNodes"].item() > 0
+    assert {"rve.h5", "rve.mat"} <= set(summary["files"])
+
+
 def case_of(path: Path, text: str) -> HomogenizationCase:
     path.write_text(text, "utf-8")
     return HomogenizationCase.read(path)
@@ -336,6 +371,9 @@ def test_computed_modes_are_alternatives(tmp_path: Path) -> None:
     # The lattice's own mode has what Eq. (mode) leaves to w, which plates then hold less.
     assert 0.85 * analytic < bloch < analytic
     assert found[0]["effects"] == [] == found[1]["effects"]
+    for kind, has_waves in (("analytic", True), ("bloch", False)):
+        with h5py.File(tmp_path / kind / "rve.h5") as rve:
+            assert ("waves/0/sine" in rve, "waves/0/covariance" in rve) == (has_waves, False)
     assert not (tmp_path / "bloch" / "experiment").exists(), "no images are needed"
 
 

@@ -31,7 +31,7 @@ OWN_CELLS = (
     "fem/lattice/geometries.py", "fem/bloch/degenerate.py", "fem/bloch/mesh_error.py",
     "src/modeharvest/runs/lattice/loads.py",
 )  # fmt: skip
-OWN_BOUNDS = {HOMOGENIZATION: (18, 3_480), OWN_CELLS: (7, 960)}
+OWN_BOUNDS = {HOMOGENIZATION: (19, 3_810), OWN_CELLS: (7, 960)}
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 
 PRIVATE_WORDS = """

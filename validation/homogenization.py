@@ -177,6 +177,38 @@ class ModeParameters:
         """The larger one that is known."""
         return self.by_noise if self.by_model_error is None else self.by_model_error
 
+    @property
+    def steps(self) -> FloatArray:
+        """(m,) changes by which differences are taken: a standard deviation, or a little more."""
+        return np.asarray(np.maximum(_LEAST_STEP, np.sqrt(np.diag(self.covariance))))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredModes:
+    """How snapped modes were measured, and how far their waves are known."""
+
+    parameters: ModeParameters
+    """Of all of them."""
+    modes: Callable[[FloatArray], Sequence[LatticeMode]]
+    """From parameters (m,), snapped."""
+
+    def derivatives(self, centre: ArrayLike) -> list[FloatArray]:
+        """(4 w, m) of each mode: its cosine and sine amplitudes, row by row, by the parameters.
+
+        Of waves whose origin is at a centre in the lattice's coordinates; by differences.
+        """
+
+        def amplitudes(values: FloatArray) -> list[FloatArray]:
+            waves = [mode.snapped.moved(-np.asarray(centre)) for mode in self.modes(values)]
+            return [np.concatenate([w.cosine.ravel(), w.sine.ravel()]) for w in waves]
+
+        values, steps = self.parameters.values, self.parameters.steps
+        changed = [amplitudes(values + step) for step in np.diag(steps)]
+        return [
+            (np.stack([there[k] for there in changed], axis=1) - here[:, None]) / steps
+            for k, here in enumerate(amplitudes(values))
+        ]
+
 
 @dataclass(frozen=True)
 class ParameterEffect:
@@ -213,9 +245,7 @@ def with_errors(
     J, is_snapped = np.zeros((len(response.values), m)), np.zeros(m, bool)
     sds = [np.full(m, np.nan) if C is None else np.sqrt(np.diag(C))
            for C in (parameters.by_noise, parameters.by_model_error)]  # fmt: skip
-    for k in range(m):
-        step = np.zeros(m)
-        step[k] = max(_LEAST_STEP, np.sqrt(parameters.covariance[k, k]))
+    for k, step in enumerate(np.diag(parameters.steps)):
         there = modes(parameters.values + step)
         is_snapped[k] = all(a.is_same(b) for a, b in zip(here, there, strict=True))
         if not is_snapped[k]:

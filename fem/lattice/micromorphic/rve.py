@@ -16,6 +16,7 @@ are q = (F̄_11, F̄_12, F̄_21, F̄_22, v_1 ..., g_1x, g_1y, ...), stresses in 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -33,6 +34,26 @@ NORMALISATIONS = ("rms", "largest", "given")
 """The mean of phi . phi over the material is 1; max |phi| at nodes is 1; phi as it is given."""
 _PERIODIC = 1e-6  # of max |phi|: by how much partner nodes may differ
 _DEPENDENT = 1e-6  # least singular value of normalised modes
+_ITERATIONS = 12
+_SMALL = 1e-10  # of the forces that a unit of F̄ makes, before one more step
+_SHORTEST = 1e-4  # of the way to given strains: the smallest step
+
+
+@dataclass(frozen=True, eq=False)
+class RVEState:
+    """An RVE in equilibrium at given generalised strains."""
+
+    strains: FloatArray
+    stresses: FloatArray
+    """(4 + 3 m,) F̄, v, g and P̄, Pi, Lambda."""
+    moduli: FloatArray
+    """(4 + 3 m, 4 + 3 m) derivatives of the stresses by the strains, w in equilibrium."""
+    energy: float
+    """Per area of the cell, holes included [MPa]."""
+    fluctuation: FloatArray
+    """(n, 2) w at the nodes of the cell [mm], <w> = 0."""
+    negative_eigenvalues: int
+    """Of the tangent in w at fixed strains; 0: stable."""
 
 
 class RVE:
@@ -47,7 +68,7 @@ class RVE:
     centre : point of the lattice from which X is measured [mm]. The cell is cut anew about it (what
         is nearer to it than to its copies), and how matters: a junction or a hole's centre.
     normalisation : of the modes, among ``NORMALISATIONS``; v_i are in mm over it. ``scales`` (m,)
-        are what modes were multiplied by.
+        are what ``modes``, as they were given, were multiplied by.
     """
 
     def __init__(
@@ -64,11 +85,12 @@ class RVE:
         self.centre = np.asarray(centre, dtype=np.float64)
         about, masters = centred_cell(cell, self.centre)
         self.cell, self.material = PeriodicCell(about, material), material
-        self.area, self.mode_count = about.area, len(modes)
+        self.area, self.mode_count, self.modes = about.area, len(modes), tuple(modes)
         self._mass = self.cell.nodal_mass
         given = [_at_nodes(mode, k, cell)[masters] for k, mode in enumerate(modes, start=1)]
         fields = np.array(given, dtype=np.float64).reshape(len(modes), len(masters), 2)
         shapes, self.scales = self._normalised(fields, normalisation)
+        self.normalisation = normalisation
         self.shapes = shapes
         """(m, n, 2) the modes at the nodes of ``cell``."""
         X = about.mesh.nodes
@@ -76,7 +98,7 @@ class RVE:
         patterns = np.concatenate([shapes, along]).reshape(3 * len(modes), X.size)
         self.carriers = np.column_stack([self.cell.affine, patterns.T])
         """(2 n, 4 + 3 m) nodal displacements [mm] of generalised strains of 1."""
-        self._constraints = self._independent(patterns) if len(modes) else None
+        self._constraints = self._independent() if len(modes) else None
 
     @property
     def at_rest(self) -> FloatArray:
@@ -95,6 +117,56 @@ class RVE:
             violation = self._constraints @ fluctuation[self.cell.free_dofs]
         u = self._carried(strains) + self.cell.reduction.displacement(fluctuation)
         return CondensedCell(self.cell, self.carriers, u, self._constraints, violation)
+
+    def equilibrium(self, strains: ArrayLike, fluctuation: FloatArray | None = None) -> RVEState:
+        """The state at strains q (4 + 3 m,), from a guess of w (n, 2) at the nodes, or in steps.
+
+        The steps go straight from the undeformed state; an InputError says how far they came.
+        """
+        q, rest = np.asarray(strains, np.float64), self.at_rest
+        if q.shape != rest.shape or not np.isfinite(q).all():
+            raise InputError(f"RVE: expected {len(rest)} finite strains, got {q.tolist()}")
+        none: FloatArray = np.zeros_like(self.cell.cell.mesh.nodes)
+        done, step, w = 0.0, 1.0, none if fluctuation is None else fluctuation
+        while done < 1.0:
+            found = self._near(rest + (done + step) * (q - rest), w)
+            if found is not None:
+                done, w = done + step, found.fluctuation
+                step = min(2.0 * step, 1.0 - done)
+                continue
+            step, w = 0.5 * step, w if done else none
+            if step < _SHORTEST:
+                raise InputError(f"RVE: expected strains with an equilibrium, found none farther "
+                                 f"than {done:.3g} of the way to {q.tolist()}")  # fmt: skip
+        assert found is not None
+        return found
+
+    def _near(self, q: FloatArray, guess: FloatArray) -> RVEState | None:
+        """The equilibrium that Newton's method finds from a guess of w at the nodes."""
+        w: FloatArray = np.zeros(self.cell.reduction.size)
+        w[self.cell.reduction.bloch_map.places] = (guess - guess[0]).ravel()  # node 0 is fixed
+        for _ in range(_ITERATIONS):
+            at = self.condensed(q, w)
+            if not at.is_regular:
+                return None
+            w = w + at.relaxed
+            if np.linalg.norm(at.forces) <= _SMALL * np.linalg.norm(at.on_carriers[:, :4]):
+                if not self.smallest_jacobian(q, w) > 0:
+                    return None
+                nodal = self.displacement(q, w) - self._carried(q)
+                stresses, moduli = at.relaxed_forces / self.area, at.condensed / self.area
+                return RVEState(q, stresses, moduli, self.energy(q, w), nodal, at.negative)
+        return None
+
+    @property
+    def averages(self) -> FloatArray:
+        """(2 + 3 m, n, 2) weights of a nodal w, whose sums over the nodes are averages over |Q|.
+
+        <w>, then <w . phi_i>, then <(w . phi_i) X>, the last two of w - <w>: no translation counts.
+        """
+        along = np.tile(np.eye(2), len(self.cell.cell.mesh.nodes))
+        weights = np.concatenate([(self._mass @ along.T).T, self._weights().T])
+        return np.asarray(weights.reshape(len(weights), -1, 2) / self.area)
 
     def energy(self, strains: FloatArray, fluctuation: FloatArray) -> float:
         """Stored energy per area of the cell, holes included [MPa]."""
@@ -134,14 +206,19 @@ class RVE:
         scales = {"rms": 1.0 / rms, "largest": 1.0 / peak, "given": np.ones(len(rms))}[how]
         return scales[:, None, None] * fields, scales
 
-    def _independent(self, patterns: FloatArray) -> FloatArray:
-        """(3 m, free) orthonormal rows C: C w = 0 is what w has to satisfy.
+    def _weights(self) -> FloatArray:
+        """(2 n, 3 m) weights of nodal w in <w . phi_i> and <(w . phi_i) X>.
 
-        With weights of mean 0, the same for any translation of w; so <w> = 0 need not be imposed.
+        They have mean 0, and so are the same for any translation of w.
         """
-        fields = patterns.reshape(len(patterns), -1, 2)
-        weights = self._mass @ (fields - self._mean(fields)).reshape(patterns.shape).T
-        rows, size = np.linalg.qr(self.cell.reduction.restricted(weights)[self.cell.free_dofs])
+        fields = self.carriers[:, 4:].T.reshape(-1, *self.cell.cell.mesh.nodes.shape)
+        free = (fields - self._mean(fields)).reshape(-1, len(self.carriers))
+        return np.asarray(self._mass @ free.T)
+
+    def _independent(self) -> FloatArray:
+        """(3 m, free) orthonormal rows C: C w = 0 is what w has to satisfy; <w> = 0 need not be."""
+        reduced = self.cell.reduction.restricted(self._weights())
+        rows, size = np.linalg.qr(reduced[self.cell.free_dofs])
         diagonal = np.abs(np.diag(size))
         if not diagonal.min() > _DEPENDENT * diagonal.max():
             raise InputError(

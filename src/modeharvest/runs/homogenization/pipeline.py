@@ -6,6 +6,7 @@
     mode.json                      mode         as it was found, snapped to the lattice, error bars
     homogenized.json               homogenize   critical strain, forces, energies, sensitivities
     homogenized.h5                              the same states as fields
+    rve.h5 rve.mat                              the RVE with modes and moduli, for other codes
     report.html summary.json       report       beside the direct simulation
 """
 
@@ -39,6 +40,7 @@ from modeharvest.runs.homogenization.case import (
     HomogenizationCase,
     MeasuredMode,
 )
+from modeharvest.runs.homogenization.export import write_fe2, write_rve
 from modeharvest.runs.homogenization.results import (
     HomogenizationData,
     HomogenizedFields,
@@ -54,6 +56,7 @@ from modeharvest.util.stages import StagedRun, exclusive, stage_key
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.homogenization import (
     LatticeMode,
+    MeasuredModes,
     ModeParameters,
     ParameterEffect,
     Response,
@@ -114,7 +117,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             return tuple(found), known, tuple(content["warnings"])
 
     def homogenize(self) -> dict[str, Any]:
-        """Follow the homogenized specimen; leaves ``homogenized.json`` and ``.h5``."""
+        """Follow the homogenized specimen; leaves ``homogenized.json``, ``.h5``, and its RVE."""
         path, fields = self.folder / "homogenized.json", self.folder / "homogenized.h5"
         modes, parameters, _ = self.mode()
         how = self.case.homogenization
@@ -144,7 +147,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                 "linearisations": found.linearisations,
             }))  # fmt: skip
             write_fields(found, body, fields)
-            return path, fields
+            errors = None if parameters is None else MeasuredModes(parameters, self._modes_of)
+            return path, fields, *self._exported(found, body, errors)
 
         self.do("homogenize", self._homogenized_key, work)
         with reading(path, "a homogenized specimen", "remove it"):
@@ -405,6 +409,28 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
         experiment, progress = self.case.experiment, named(self.progress, what)
         return homogenize(body, self.case.loads, experiment.path, progress)
+
+    def _exported(
+        self, found: Homogenized, body: HomogenizedBody, measured: MeasuredModes | None
+    ) -> tuple[Path, Path]:
+        """Write the first RVE at a point, with the state before the critical point, too."""
+        rve, before = body.rves[0], [found.critical.state] if found.critical else []
+        every = sorted([*before, *found.states], key=lambda state: state.load)
+        count, step = len(body.places), len(body.rves)
+        states = [
+            rve.equilibrium(q, rve.cell.reduction.displacement(w))
+            for state in every
+            for q, w in zip(state.strains, body.fluctuations(state.value)[::step], strict=True)
+        ]
+        paths = self.folder / "rve.h5", self.folder / "rve.mat"
+        write_rve(
+            paths[0], rve, states, measured,
+            loads=np.repeat([state.load for state in every], count),
+            points=np.tile(body.places, (len(every), 1)),
+            buckled=np.repeat([int(state.branch != "primary") for state in every], count),
+        )  # fmt: skip
+        write_fe2(paths[1], rve)
+        return paths
 
     def _predicted(self, modes: Sequence[LatticeMode], what: str) -> Response:
         return response_of(self._followed(self._body([mode.snapped for mode in modes]), what))

@@ -181,6 +181,8 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
         "linearisations": found["linearisations"],
         "files": {
             "homogenized.h5": "mesh and states: u, v_i, generalised strains, stresses, RVEs (HDF5)",
+            "rve.h5": "the RVE for other codes: mesh, pairs, modes, moduli (HDF5)",
+            "rve.mat": "the same mesh, pairs and modes in the layout of a MATLAB FE2 code",
             "homogenized.json": "critical strain, forces, energies, sensitivities",
             "mode.json": "the modes as they were measured and snapped, with their covariances",
             "experiment/": "the virtual experiment: simulation, images, what was measured in them",
