@@ -242,15 +242,14 @@ class _LoadSearch:
         return None if state is None else self.history[state.load]
 
     def _root(self, low: float, high: float) -> LatticeCritical:
-        """The critical point between a stable and an unstable load."""
+        """The critical point between a stable and an unstable load.
 
-        def value(load: float) -> float:
-            known = self.history.get(load) or self._measured(self._near(low, load))
-            assert known is not None
-            return known.value
-
-        load = float(brentq(value, low, high, xtol=_TOLERANCE, rtol=1e-14))
-        value(load)
+        All waves are looked at where the least stable one of before is critical by itself.
+        """
+        last, load, exact = math.inf, high, _TOLERANCE * self.history[0.0].value
+        while last - load > _TOLERANCE * load and self.history[load].value < -exact:
+            last, load = load, self._critical_load(self.history[load], low, load)
+            self._measured(self._near(low, load))
         least, state = self.history[load], self._near(low, load)
         none: tuple[tuple[Wave, ...], float, float] = ((), 0.0, 0.0)
         waves, split, bound = none if least.angle is not None else self._set(state, least)
@@ -263,6 +262,15 @@ class _LoadSearch:
         text += self._where
         known = (waves, state, self._by_load(), below, above, split, bound, earlier)
         return LatticeCritical(load, True, text, least, *known)
+
+    def _critical_load(self, least: LeastStable, low: float, high: float) -> float:
+        """Where a wave that is unstable at a load is critical."""
+
+        def value(load: float) -> float:
+            waves, angle = BlochWaves(self.path.cell, self._near(low, load)), least.angle
+            return self.zone.at(waves, least.wave).value if angle is None else waves.acoustic(angle)
+
+        return float(brentq(value, low, high, xtol=_TOLERANCE * high, rtol=1e-14))
 
     def _near(self, low: float, load: float) -> CellState:
         """The equilibrium at a load near the critical one, reached from the stable side afresh.
