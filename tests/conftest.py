@@ -7,7 +7,7 @@ import importlib.util
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NoReturn
@@ -96,6 +96,18 @@ def unrendered_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     from modeharvest.report.figures import style
 
     monkeypatch.setattr(style, "to_svg", lambda *_, **__: "<svg></svg>")
+
+
+@pytest.fixture
+def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the figures of reports out, where a test is not about them and others compose them."""
+    from modeharvest.report import model
+    from modeharvest.util.progress import Progress, counted, silent
+
+    def blank(figures: Iterable[model.ReportFigure], progress: Progress = silent) -> dict[str, str]:
+        return {f.name: "<svg></svg>" for f in counted(list(figures), progress, "report")}
+
+    monkeypatch.setattr(model, "draw_figures", blank)
 
 
 def pytest_configure(config: pytest.Config) -> None:

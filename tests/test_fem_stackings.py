@@ -40,7 +40,7 @@ from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies.study import ImagePairSpec
 
-pytestmark = pytest.mark.usefixtures("coarse_pictures")
+pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
 
 RECTANGULAR = Specimen(4, 6, diameter=1.5, diameter_y=1.7, stacking="rectangular", pitch_y=2.0)
 TRIANGULAR = Specimen(3, 5, diameter=1.5, stacking="triangular", bulk_x=1.0, bulk_y=0.5)

@@ -19,7 +19,7 @@ from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.util.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("coarse_pictures")
+pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
 
 PITCH, PIXEL = 1.9, 0.042
 FloatArray = NDArray[np.float64]

@@ -109,6 +109,7 @@ def test_the_noise_is_measured(harvested: Path) -> None:
     assert found["sd"] == pytest.approx(np.hypot(255 * NOISE, 1 / np.sqrt(12)), rel=0.06)
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_again_repeats_nothing(harvested: Path, photographs: Path) -> None:
     files = [*harvested.glob("results/*"), *harvested.glob("prepared/*")]
     before = {path: path.stat().st_mtime_ns for path in files}
@@ -118,6 +119,7 @@ def test_again_repeats_nothing(harvested: Path, photographs: Path) -> None:
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_an_interrupted_harvest_goes_on(harvested: Path, photographs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(harvested, out)
@@ -152,6 +154,7 @@ def test_damaged_and_foreign_frames_are_skipped_and_told(
         assert "\n" not in reason
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_the_updated_formulation_agrees_with_the_total_one(
     photographs: Path, harvested: Path, tmp_path: Path
 ) -> None:

@@ -229,6 +229,7 @@ def test_a_family_with_fewer_parameters_takes_the_place_of_free_waves(
     assert rms_px(found.result.displacement() - square.displacement(), SCENE.mask) < 0.01
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_where_every_correlation_is_trapped_the_refitted_ansatz_is_the_result(
     photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -157,6 +157,7 @@ def test_the_table_for_own_plots_is_the_hdf5_s(finished: Path) -> None:
     assert {row["corner"] for row in rows} == {"", *found.labels}
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_running_again_does_nothing(case: Path, folder: Path) -> None:
     # The folder's name is in the report, so that is made anew once.
     summary = run(case, folder)
@@ -168,6 +169,7 @@ def test_running_again_does_nothing(case: Path, folder: Path) -> None:
     assert stamps(folder) == before
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_a_changed_table_repeats_only_what_depends_on_it(case: Path, folder: Path) -> None:
     run(case, folder)
     before = stamps(folder)
@@ -188,6 +190,7 @@ def test_bloch_shows_nothing_of_another_case(case: Path, folder: Path) -> None:
     assert summary["branches"] == summary["families"] == []
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 @pytest.mark.parametrize("step", ["dispersion", "mode families"])
 def test_an_interrupted_analysis_continues_to_the_same_end(
     case: Path, finished: Path, folder: Path, step: str
@@ -275,6 +278,7 @@ def test_a_study_goes_on_from_where_it_was(
     assert "Study of 1 lattice" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_the_commands_print_a_short_table(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], case: Path, folder: Path
 ) -> None:
@@ -373,6 +377,7 @@ def test_degenerate_waves_are_in_the_order_of_their_phases(tmp_path: Path) -> No
     ]
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 @pytest.mark.parametrize(
     "victim", ["critical.json", "dispersion.h5", "modes.h5", "family_branch_1.json"]
 )
