@@ -76,14 +76,17 @@ class ImagedState:
         cells = mesh.cells[self._reaching(nodes, selected, float(np.abs(offsets).max(initial=0.0)))]
         position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)
         place, pattern = polynomials(mesh.element, cells, position), self.speckle.spline.table
-        total, selected = np.zeros(grid.shape), np.ascontiguousarray(selected)
+        selected = np.ascontiguousarray(selected)
+        chosen = np.flatnonzero(selected)
+        first = np.searchsorted(chosen, np.arange(0, grid.rows + _BAND, _BAND) * grid.cols)
+        total = np.zeros(chosen.size)
         for (down, right), weight in zip(offsets, weights, strict=True):
             moved = replace(grid, x0=float(grid.x0 + h * right), y0=float(grid.y0 - h * down))
             elements = tabulate_elements(nodes, cells, mesh.element, moved)
             start, visits = bands(elements, grid.rows, _BAND)
             in_parallel(_add, elements, place, pattern, self.background, start, visits,
-                        float(weight), selected, total)  # fmt: skip
-        return total[selected]
+                        float(weight), selected, chosen, first, total)  # fmt: skip
+        return total
 
     def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
         """(m,) True for elements that may hold a point within ``reach`` px of a selected pixel."""
@@ -174,35 +177,39 @@ def _add(
     visits: IntArray,
     weight: float,
     selected: BoolArray,
+    chosen: IntArray,
+    first: IntArray,
     total: FloatArray,
     thread: int,
     threads: int,
 ) -> None:
-    """Add a weight times the selected pixels' grey levels to ``total``; others get anything.
+    """Add a weight times the selected pixels' grey levels to ``total`` (k,).
 
-    ``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are.
+    ``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are. ``chosen``
+    (k,) are the numbers of the selected pixels, those of band b from ``first[b]`` on.
     """
-    rows, cols = total.shape
+    rows, cols = selected.shape
     where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
     shown, work = np.empty(BLOCK), workspace()
     for band in range(thread, start.size - 1, threads):
         top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
-        if not selected[top:bottom].any():
+        if first[band] == first[band + 1]:
             continue
-        sums, size = total[top:bottom].ravel(), (bottom - top) * cols
+        size = (bottom - top) * cols
         element, at = np.empty(size, dtype=np.int32), np.empty((2, size))
         pixels = Pixels(element, at, np.empty(0, dtype=np.float32), top, cols, 0.0, 0.0, 1.0)
         visited = visits[start[band] : start[band + 1]]
         fill(elements, place, pixels, selected.ravel(), visited, top, bottom)
         count = 0
-        for k in range(size):
+        for n in range(first[band], first[band + 1]):
+            k = chosen[n] - top * cols
             if element[k] >= 0:
-                where[count], row[count], col[count] = k, at[0, k], at[1, k]
+                where[count], row[count], col[count] = n, at[0, k], at[1, k]
                 count += 1
             else:
-                sums[k] += weight * background
-            if count == BLOCK or (k == size - 1 and count > 0):
+                total[n] += weight * background
+            if count == BLOCK or (n == first[band + 1] - 1 and count > 0):
                 sample(pattern, row[:count], col[:count], shown[:count], work)
-                for n in range(count):
-                    sums[where[n]] += weight * shown[n]
+                for m in range(count):
+                    total[where[m]] += weight * shown[m]
                 count = 0

@@ -147,7 +147,10 @@ def _tabulate(
             c = elements.sides[e, side, 0]
             low = min(low, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
             high = max(high, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
-        elements.affine[e] = np.abs(elements.polynomials[e, :, 3:]).sum() <= _AFFINE_PX
+        bent = 0.0
+        for m in range(3, 9):
+            bent += abs(elements.polynomials[e, 0, m]) + abs(elements.polynomials[e, 1, m])
+        elements.affine[e] = bent <= _AFFINE_PX
         elements.row_from[e] = min(max(int(np.ceil(low - 1e-9 + centre[0])), 0), rows)
         elements.row_to[e] = min(max(int(np.floor(high + 1e-9 + centre[0])) + 1, 0), rows)
 
