@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,13 +26,15 @@ from modeharvest.idic.solver.assembly import Assembly, residual
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 
 
 def lengths(field: FloatArray) -> FloatArray:
     """(...) Euclidean lengths of the vectors of a field (..., 2)."""
     x, y = field[..., 0], field[..., 1]
-    return np.asarray(np.sqrt(x * x + y * y))
+    squares = np.asarray(x * x)
+    squares += y * y
+    return np.sqrt(squares, out=squares)
 
 
 def rms(values: NDArray[Any]) -> float:
@@ -84,15 +85,16 @@ class Comparison:
     result: Result
     best: Result
     """The best fit of the result's ansatz to it."""
-    residual: FloatArray
+    residual: FloatImage
     """(rows, cols) f - g(x + u) [grey levels, fraction of full scale]; NaN where not compared."""
 
-    @cached_property
+    # Made anew when asked for: that takes little time, and kept they are most of the memory.
+    @property
     def w(self) -> FloatArray:
         """(rows, cols, 2) microfluctuation field, truth - IDIC [mm]."""
         return _difference(self.displacement, self.result.displacement())
 
-    @cached_property
+    @property
     def best_error(self) -> FloatArray:
         """(rows, cols, 2) truth - best fit [mm]: the model (ansatz) error."""
         return _difference(self.displacement, self.best.displacement())
@@ -100,7 +102,7 @@ class Comparison:
     @property
     def idic_to_best(self) -> FloatArray:
         """(rows, cols, 2) IDIC - best fit [mm]: the measurement error; NaN off the mask."""
-        return self.best_error - self.w
+        return _difference(self.best_error, self.w)
 
     def statistics(self) -> dict[str, VectorStatistics]:
         """Of the error ``w`` and of its parts ``best_fit`` and ``idic_to_best_fit`` [px]."""
@@ -143,8 +145,7 @@ def compare(
     best = best_fit(truth, result, guesses=(start,))
     f, g = images.reference(camera=camera), images.deformed(strain, camera=camera)
     left = residual(Assembly(result.ansatz, grid, mask), result.unknowns, f, SplineImage.of(g))
-    displacement = truth.displacement
-    return Comparison(strain, grid, mask, displacement, result, best, left.astype(np.float64))
+    return Comparison(strain, grid, mask, truth.displacement, result, best, left)
 
 
 def pattern_field(result: Result, grid: PixelGrid | None = None) -> FloatArray:

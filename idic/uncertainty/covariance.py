@@ -115,8 +115,9 @@ class MatchedImages:
         assert level.valid is not None  # on the finest level
         every = Assembly(result.ansatz, result.grid, level.mask)
         used, _ = valid_pixels(every, result.unknowns, level.reference, level.deformed, level.valid)
-        row, col = np.indices(result.grid.shape, dtype=np.float64)
-        deformed = level.deformed.sample(row, col)[0].astype(np.float32)
+        deformed = np.empty(result.grid.shape, np.float32)
+        for row, line in enumerate(deformed):
+            line[:] = level.deformed.sample(row, np.arange(line.size))[0]
         return cls(result, level.reference, deformed, used)
 
     @cached_property

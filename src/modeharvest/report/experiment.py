@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
@@ -145,7 +146,7 @@ def _image(state: SnapshotState) -> Figure:
 
 def _residual(state: SnapshotState) -> Figure:
     map_frame = state.view.map_frame(fits.FINE)
-    residual = map_frame.sample(state.comparison.residual)
+    residual = map_frame.sample(state.comparison.residual.astype(np.float64))
     return draw_field(map_frame, residual, ColourScale.signed(residual, "", 0.99), state.motion)
 
 
