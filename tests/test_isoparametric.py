@@ -428,3 +428,28 @@ def test_lost_nodes_are_refused_by_number(value: float) -> None:
 def test_valid_mesh_passes() -> None:
     nodes, cells = patch(3, 1, 0.2)
     require_positive_jacobian(nodes, cells, "T6")
+
+
+@pytest.mark.parametrize("flat", [0.0, 1e-9, 1e-5, 1e-3, 0.3])
+def test_straight_triangles_and_hardly_curved_ones_cover_the_same_pixels(flat: float) -> None:
+    """Corners at pixel centres, sides along rows or nearly so: on an affine map and on no such one.
+
+    Moved mid-sides by 1e-11 px make Newton's method take over, with ends on curved sides.
+    """
+    rng, grid = np.random.default_rng(3), PixelGrid(41, 41, 1.0, 0.0, 0.0)
+    corners = np.round(rng.uniform(2.0, 38.0, (200, 3, 2))) - [0.0, 40.0]
+    corners[:, 1, 1] = corners[:, 0, 1] + flat * rng.uniform(-1.0, 1.0, 200)
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    corners[area < 0] = corners[area < 0][:, [1, 0, 2]]
+    seen = 0
+    for triangle in corners[np.abs(area) > 2.0]:
+        middle = 0.5 * (triangle + np.roll(triangle, -1, axis=0))
+        six = np.vstack([triangle, middle + 1e-11 * rng.standard_normal((3, 2))])
+        straight = locate(triangle, np.arange(3)[None, :], "T3", grid)
+        curved = locate(six, np.arange(6)[None, :], "T6", grid)
+        np.testing.assert_array_equal(straight.mask, curved.mask)
+        np.testing.assert_allclose(straight.xi, curved.xi, atol=1e-9)
+        assert straight.max_residual_px < ACCEPTED_PX
+        seen += int(straight.mask.sum())
+    assert seen > 10_000
