@@ -9,13 +9,14 @@ import foreign_cells as made
 import meshio
 import numpy as np
 import pytest
+from fem_bodies import plate
 
 from modeharvest.fem.bloch.critical import first_critical
 from modeharvest.fem.bloch.degenerate import Degeneracy, Transport, distinct_combinations
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves
 from modeharvest.fem.bloch.mesh_error import elements_across, ligament_notes, load_error, refined
 from modeharvest.fem.bloch.real_modes import real_modes
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import Mesh, with_mid_sides
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, chiral, hexagonal, square
 from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, equibiaxial, uniaxial
@@ -215,6 +216,22 @@ def test_a_refined_mesh_fills_the_same_curved_outline() -> None:
     masses = [PeriodicCell(cell, TwoTermI1()).nodal_mass.sum() for cell in (SQUARE, finer)]
     assert masses[1] == pytest.approx(masses[0], rel=1e-4)  # three points a triangle
     assert len(finer.symmetry.operations) == 7
+
+
+def test_a_cell_without_holes_has_no_ligaments_and_no_primitive_cell() -> None:
+    cell = UnitCell(plate(2.0, 1.0, 4, 2), np.diag([2.0, 1.0]))
+    assert primitive_cell(cell) is cell
+    assert ligament_notes(cell) == []
+    assert cell.symmetry.operations == ()
+
+
+def test_holes_that_touch_at_corners_are_no_fault() -> None:
+    """A diamond in a square: the lattice of rotating squares."""
+    corners = np.array([[0.5, 0.0], [1.0, 0.5], [0.5, 1.0], [0.0, 0.5], [0.5, 0.5]])
+    cells = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    cell = UnitCell(Mesh(*with_mid_sides(corners, cells), "T6"), np.eye(2))
+    assert len(cell.symmetry.translations) == 1
+    assert elements_across(cell)[0] >= 1
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def elements_across(cell: UnitCell) -> tuple[int, FloatArray]:
         hole[b[reached]], copy[b[reached]] = hole[a[reached]], copy[a[reached]] - step[reached]
         layer[b[reached]] = layer.max() + 1
     meet = np.flatnonzero((hole[a] != hole[b]) | np.any(copy[a] - step != copy[b], axis=1))
-    if not len(meet):
+    if not (len(outline.areas) and len(meet)):
         return len(cell.mesh.cells), cell.mesh.nodes[0]
     across = layer[a[meet]] + layer[b[meet]] + 1
     least = int(np.argmin(across))

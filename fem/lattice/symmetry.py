@@ -125,7 +125,7 @@ class Outline:
             y = np.roll(x, -1, axis=0)
             parts = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
             areas.append(float(0.5 * parts.sum()))
-            centroids.append(parts @ (x + y) / (3.0 * parts.sum()))
+            centroids.append(parts @ (x + y) / (3.0 * (parts.sum() or 1.0)))  # a crack has no area
         self.areas, self.centroids = np.array(areas), np.array(centroids).reshape(-1, 2)
 
     def _roughness(self, slope: FloatArray, length: FloatArray) -> float:
@@ -138,7 +138,7 @@ class Outline:
 
     def candidates(self, turn: FloatArray) -> FloatArray:
         """(c, 2) moves after a turn that carry the rarest hole onto one like it, in the cell."""
-        alike = np.abs(self.areas[:, None] / self.areas - 1.0) < _ALIKE
+        alike = np.abs(self.areas[:, None] - self.areas) <= _ALIKE * np.abs(self.areas)
         rarest = int(np.argmin(alike.sum(axis=1)))
         moves = self.centroids[alike[rarest]] - turn @ self.centroids[rarest]
         return np.asarray(np.mod(np.round(moves @ self._inverse, 9), 1.0) @ self.lattice)
