@@ -540,7 +540,9 @@ def test_modes_of_a_cell_come_with_it(tmp_path: Path) -> None:
 
     cell = PeriodicCell(square(1.9, 1.7, 0.5), Ogden())
     found = critical_at(CellPath(cell, equibiaxial()), (math.pi, math.pi))
-    write_modes(tmp_path / "modes.h5", real_modes(cell, found.state, [(math.pi, math.pi)]))
+    modes = real_modes(cell, found.state, [(math.pi, math.pi)])
+    write_modes(tmp_path / "modes.h5", modes)
+    write_modes(tmp_path / "gap.h5", replace(modes, lattice=1.01 * modes.lattice))
     text = FLOWER.replace('stacking = "triangular"', "").replace(
         '"bloch"', '"file"\npath = "modes.h5"'
     )
@@ -553,6 +555,7 @@ def test_modes_of_a_cell_come_with_it(tmp_path: Path) -> None:
         (("diameter = 1.7", "diameter = 1.6"), r"modes of the specimen's lattice, solid to 44.3%"),
         (("diameter = 1.7", "diameter = 1.7\npitch = 2.0"), r"cell with vectors \[\[1.9, 0.0\]"),
         (('path = "modes.h5"', 'path = "modes.h5"\nnumbers = [2]'), "expected 2 modes, got 1"),
+        (("modes.h5", "gap.h5"), "no direction has partners"),
     ):
         other = case_of(tmp_path / "other.toml", text.replace(*change))
         with pytest.raises(InputError, match=message):
