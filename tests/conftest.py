@@ -37,19 +37,28 @@ settings.register_profile(
 settings.load_profile("modeharvest")
 
 FILES_THAT_TAKE_LONG = (
-    "test_pipeline.py",
     "test_disturbed.py",
-    "test_lattice_pipeline.py",
-    "test_measure.py",
-    "test_damaged_files.py",
-    "test_fem_bloch.py",
+    "test_pipeline.py",
+    "test_homogenization_run.py",
+    "test_fem_homogenization.py",
     "test_harvest_whole_field.py",
+    "test_damaged_files.py",
+    "test_campaign.py",
+    "test_measure.py",
+    "test_studies.py",
+    "test_lattice_pipeline.py",
+    "test_fem_bloch.py",
     "test_fem_simulate.py",
-    "test_harvest_pipeline.py",
-    "test_harvest_sequence.py",
-    "test_harvest_patterns.py",
+    "test_lattice_symmetry.py",
     "test_whole_measure.py",
     "test_weighting.py",
+    "test_harvest_patterns.py",
+    "test_harvest_pipeline.py",
+    "test_error_bars.py",
+    "test_fem_stackings.py",
+    "test_correlate_noise.py",
+    "test_fem_postbuckling.py",
+    "test_harvest_sequence.py",
 )
 """They come first where several processes share out the files, or one would end long after all."""
 

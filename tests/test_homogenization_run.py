@@ -250,7 +250,7 @@ def test_what_can_not_be_homogenized_is_refused(
 
 
 @pytest.mark.dolfinx
-@pytest.mark.usefixtures("coarse_pictures")
+@pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
 def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
@@ -364,7 +364,8 @@ def test_computed_modes_are_alternatives(tmp_path: Path) -> None:
     found = []
     for kind in ("analytic", "bloch"):
         case = tmp_path / f"{kind}.toml"
-        case.write_text(SMALL.replace("measured", kind) + "fixed_mode = true", "utf-8")
+        text = SMALL.replace("measured", kind).replace("[0.03, 0.13]", "[0.1]")
+        case.write_text(text + "fixed_mode = true", "utf-8")
         out = tmp_path / kind
         found.append(HomogenizationRun(HomogenizationCase.read(case), out).homogenize())
     analytic, bloch = (content["response"]["critical_strain"] for content in found)
