@@ -19,7 +19,7 @@ from scipy.optimize import brentq, minimize
 from modeharvest.fem.bloch.degenerate import Degeneracy, folded, is_same
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves, scan
 from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
-from modeharvest.fem.lattice.options import CENTRE, CriticalSearch, Wave
+from modeharvest.fem.lattice.options import CENTRE, CriticalSearch, Wave, wave_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -172,24 +172,16 @@ def first_critical(
 
 
 def critical_at(
-    path: CellPath, wave: Wave | None, search: CriticalSearch | None = None
+    path: CellPath, wave: Wave, search: CriticalSearch | None = None
 ) -> LatticeCritical:
     """The first load at which the given wave is critical, whatever the others do.
 
     (0, 0) stands for the modes with the period of the cell, which may be an enlarged one. F̄ is
-    fixed while a mode grows. None stands for waves much longer than the cell.
+    fixed while a mode grows.
     """
     search = search or CriticalSearch()
-    zone = Zone(path.cell, search.divisions)
-
-    def measure(state: CellState) -> LeastStable:
-        waves = BlochWaves(path.cell, state)
-        if wave is None:
-            value, angle = waves.long_wave()
-            return LeastStable(state.load, value, CENTRE, angle)
-        return zone.at(waves, wave)
-
-    return _LoadSearch(path, search, zone, measure, silent).run()
+    zone = Zone(path.cell, search.divisions, [wave_of(wave)])
+    return _LoadSearch(path, search, zone, zone.least_stable, silent).run()
 
 
 @dataclass(eq=False)

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves
@@ -158,23 +160,14 @@ def distinct_combinations(cell: PeriodicCell, modes: ModeSet) -> tuple[tuple[flo
     few = (*alone, (1.0,) * count) if count > 1 else tuple(alone)
     if count > _MOST_MODES:
         return few
-    maps = _actions(cell, modes)
+    maps = _actions(cell, modes)  # that of the identity is among them
     rows = [row for row in product((1.0, 0.0, -1.0), repeat=count) if any(row)]
     rows.sort(key=lambda row: (np.count_nonzero(row), sum(c < 0 for c in row)))
     units = np.array(rows) / np.linalg.norm(rows, axis=1, keepdims=True)
-    found, seen = [], np.zeros(len(rows), dtype=bool)
-    for k, row in enumerate(rows):
-        if seen[k]:
-            continue
-        found.append(row)
-        seen[k], fresh = True, [k]
-        while fresh:
-            images = units[fresh] @ maps.transpose(0, 2, 1)  # (g, f, m)
-            off = np.linalg.norm(images.reshape(-1, 1, count) - units, axis=2)
-            reached = np.unique(np.argmin(off, axis=1)[off.min(axis=1) < _ALIKE])
-            fresh = [int(r) for r in reached if not seen[r]]
-            seen[fresh] = True
-    return tuple(found) if len(found) <= _MOST_BRANCHES else few
+    off = np.linalg.norm((units @ maps.transpose(0, 2, 1))[:, :, None] - units, axis=3)
+    kind = connected_components(coo_array(np.any(off < _ALIKE, axis=0)))[1]
+    first = np.sort(np.unique(kind, return_index=True)[1])
+    return tuple(rows[k] for k in first) if len(first) <= _MOST_BRANCHES else few
 
 
 def _actions(cell: PeriodicCell, modes: ModeSet) -> FloatArray:
@@ -183,9 +176,9 @@ def _actions(cell: PeriodicCell, modes: ModeSet) -> FloatArray:
     first = np.unique(reduction.periodicity.master, return_index=True)[1]
     shapes = modes.shapes[:, first].reshape(len(modes.waves), -1).T[reduction.order]
     weighed = cell.mass(CENTRE) @ shapes / (cell.filling * cell.cell.area)
-    moves = [Symmetry(np.eye(2), move) for move in symmetry.translations]
-    turns = [by for by in symmetry.operations if by.keeps(modes.gradient)]
-    every = [by for by in (*moves, *turns) if transport.keeps_cells(by)]
+    every = [Symmetry(np.eye(2), move) for move in symmetry.translations]
+    turns = (by for by in symmetry.operations if by.keeps(modes.gradient))
+    every += [by for by in turns if transport.keeps_cells(by)]
     return np.array([weighed.T @ transport.image(shapes, CENTRE, by)[0] for by in every])
 
 

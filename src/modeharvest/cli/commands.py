@@ -143,9 +143,9 @@ def _stages(
 def bloch(case: CaseName, out: OutFolder) -> None:
     """Analyse an infinite lattice: what makes it buckle first, of all waves (needs dolfinx).
 
-    Square, hexagonal or chiral, or with kind = "file" a mesh or geometry of your own: see
-    'modeharvest cases square-lattice'. Leaves the first critical load and waves with their proof,
-    eigenvalues against the wave vector (dispersion.csv, .h5), report.html and summary.json.
+    Square, hexagonal or chiral, or with kind = "file" a mesh or geometry of your own (see
+    docs/lattices.md). Leaves the first critical load and waves with their proof, eigenvalues
+    against the wave vector (dispersion.csv, dispersion.h5), report.html and summary.json.
     """
     _analyse(case, out, whole=False)
 

@@ -137,7 +137,8 @@ def findings(summary: Summary) -> list[str]:
                             proof=proof(point)))  # fmt: skip
         if point["error"] is not None:
             error = load.text(point["error"], 2)
-            text.append(text_of("lattice-error", load=load, error=error, order=point["order"]))
+            text.append(text_of("lattice-error", load=load, error=error, order=point["order"],
+                                share=point["error"] / point["load"]))  # fmt: skip
     elif point is not None:
         text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
     for part in summary["zone"]:
