@@ -48,6 +48,18 @@ def test_the_guide_has_every_key_of_the_summary() -> None:
     assert undocumented(summary_of(run, run.patterns), "bloch.md") == set()
 
 
+def test_a_degenerate_set_that_the_mesh_splits_is_warned_of() -> None:
+    run = made_up.run()
+    summary = summary_of(run, run.patterns)
+    summary["critical"] |= {"waves": [[1.0, 0.0], [0.0, 1.0]], "splitting": 1e-7}
+    assert not any("splits" in warning for warning in lattice_report(summary).warnings)
+    summary["critical"] |= {"splitting": 0.0032, "splitting_bound": 0.07}
+    (found,) = [warning for warning in lattice_report(summary).warnings if "splits" in warning]
+    assert "0.32" in found
+    assert "7" in found
+    assert "mesh one sector" in found
+
+
 def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
     seen = Page(text)
     assert seen.open == []

@@ -76,7 +76,7 @@ def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
             Section.of("family", [_family_card(p) for p in run.patterns] if run else []),
             *([_study_section(run.study)] if run and run.study else []),
         ],
-        warnings=summary["notes"],
+        warnings=[*summary["notes"], *_splitting(summary["critical"])],
         notes=notes(summary),
         command=run.command if run else "",
         case=summary["case"],
@@ -154,6 +154,12 @@ def findings(summary: Summary) -> list[str]:
     return text
 
 
+def _splitting(point: Mapping[str, Any] | None) -> list[str]:
+    """A warning where the mesh splits a degenerate set."""
+    is_split = point is not None and len(point["waves"]) > 1 and point["splitting"] > 1e-5
+    return [text_of("lattice-splitting", **point)] if point and is_split else []
+
+
 def key_numbers(summary: Summary) -> list[KeyNumber]:
     """The few numbers at the top."""
     keys, point, load = [], summary["critical"], LoadQuantity(**summary["load"])
@@ -202,8 +208,6 @@ def notes(summary: Summary) -> list[str]:
         text.append(text_of("lattice-no-proof", outcome=summary["outcome"], point=point, load=load))
     elif point is not None and point["long_wave_angle"] is not None:
         text.append(text_of("lattice-long-waves", loading=point["loading"]))
-    if point is not None and point["splitting"] > 1e-5:
-        text.append(text_of("lattice-splitting", **point))
     if any(branch["states"] for branch in summary["branches"]):
         text.append(text_of("lattice-branches"))
     if summary["study"] is not None:
