@@ -6,7 +6,9 @@ docs/homogenization.md, as Markdown:
 - ``cell``: homogeneous patterns: critical strain and stress on the branch, against Bloch waves and
   the branch of the periodic cell.
 - ``strips``: n cells between clamped plates, periodic sideways: direct simulations (mean of two
-  positions of the lattice against the plates), and homogenized ones.
+  positions of the lattice against the plates), and homogenized ones with an analytic mode, the
+  critical Bloch mode, and the mode that is measured in the images of the case paper-homogenized.
+  ``--picture PNG`` draws the size effect.
 - ``specimen``: the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
 - ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.
 - ``positions``: means over N x N centres of the RVE, spread evenly over a cell, N = 1 to 4, of
@@ -31,6 +33,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -70,6 +73,10 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.report.figures.style import BLUE, GOLD, GREEN, RED, figure
+from modeharvest.runs.homogenization.case import HomogenizationCase
+from modeharvest.runs.homogenization.pipeline import HomogenizationRun
+from modeharvest.util.files import atomic
 from modeharvest.validation.homogenization import LatticeMode
 
 FloatArray = NDArray[np.float64]
@@ -185,31 +192,94 @@ def homogenized_strip(cells: int, rve: RVE | list[RVE]) -> tuple[float, list[flo
     return critical, [state.force / (2 * PITCH) for state in found.states]
 
 
+@cache
+def measured() -> RVE:
+    """With the mode that the images of the shipped case show, snapped to the lattice."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = HomogenizationRun(HomogenizationCase.read("paper-homogenized"), Path(folder))
+        run.virtual.fem()
+        run.virtual.image()
+        (mode,), _, _ = run.mode()
+    return RVE(supercell(), MATERIAL, [mode.snapped], JUNCTION)
+
+
+MODES = {"analytic φ": analytic, "Bloch φ": computed, "measured φ": measured}
+STRESSES = (0.08, 0.1)
+"""Nominal strains at which stresses are compared [-]."""
+
+
+def size_effect() -> dict[str, FloatArray]:
+    """Critical strain [-] and stresses [MPa] (n, 3) of strips, of each kind of prediction.
+
+    Direct simulations are (n, 2, 3), for the lattice's two positions against the plates.
+    """
+    free = PlateLoading(sides="periodic", pattern_at_plates="free")
+    one = HomogenizedBody.of_specimen(
+        Specimen(2, 2, bulk_x=0, bulk_y=0), analytic(), free, divisions=(1, 1)
+    )
+    local = homogenize(one, STRESSES)
+    assert local.critical is not None  # with plates that hold F̄ alone, the same for every n
+    first = local.critical.load, *(state.force / (2 * PITCH) for state in local.states)
+    found: dict[str, FloatArray] = {"direct": np.array([
+        [(e, *stresses) for e, stresses in (direct_strip(n, is_cut) for is_cut in (False, True))]
+        for n in REFERENCE
+    ])}  # fmt: skip
+    for name, rve in MODES.items():
+        strips_of = [homogenized_strip(n, rve()) for n in REFERENCE]
+        found[name] = np.array([(e, *stresses) for e, stresses in strips_of])
+    return found | {"first order": np.tile(first, (len(REFERENCE), 1))}
+
+
 def strips() -> None:
+    found = size_effect()
+    direct, kinds = found["direct"].mean(axis=1), [*MODES, "first order"]
     head(
-        "cells", "direct ε_c [%]", "analytic φ", "Bloch φ", "first order",
-        "direct stress at 8, 10 % [MPa]", "analytic φ", "Bloch φ", "first order",
+        "cells", "direct ε_c [%]", *kinds, "direct stress at 8, 10 % [MPa]", *kinds,
         "independent: direct, analytic φ",
     )  # fmt: skip
-    free = PlateLoading(sides="periodic", pattern_at_plates="free")
-    one = Specimen(2, 2, bulk_x=0, bulk_y=0)
-    local = homogenize(
-        HomogenizedBody.of_specimen(one, analytic(), free, divisions=(1, 1)), [0.08, 0.1]
-    )
-    assert local.critical is not None  # with plates that hold F̄ alone, the same for every n
-    first = local.critical.load, [state.force / (2 * PITCH) for state in local.states]
-    for n in REFERENCE:
-        both = [direct_strip(n, is_cut) for is_cut in (False, True)]
-        exact = np.mean([e for e, _ in both])
-        stress = np.mean([s for _, s in both], axis=0)
-        others = [homogenized_strip(n, rve) for rve in (analytic(), computed())] + [first]
-        strains = [f"{100 * e:.3f} ({e / exact - 1:+.1%})" for e, _ in others]
-        stresses = [", ".join(f"{x:+.1%}" for x in s / stress - 1) for _, s in others]
+    for k, n in enumerate(REFERENCE):
+        e, *stress = direct[k]
+        both = ", ".join(f"{100 * x:.3f}" for x in found["direct"][k, :, 0])
+        strains = [found[kind][k, 0] for kind in kinds]
+        changes = [found[kind][k, 1:] / stress - 1 for kind in kinds]
         row(
-            n, f"{100 * exact:.3f} ({100 * both[0][0]:.3f}, {100 * both[1][0]:.3f})", *strains,
-            ", ".join(f"{s:.5f}" for s in stress), *stresses,
+            n, f"{100 * e:.3f} ({both})", *(f"{100 * x:.3f} ({x / e - 1:+.1%})" for x in strains),
+            ", ".join(f"{s:.5f}" for s in stress),
+            *(", ".join(f"{x:+.1%}" for x in change) for change in changes),
             ", ".join(f"{e:.3f}" for e in REFERENCE[n]),
         )  # fmt: skip
+    if PICTURE:
+        draw_size_effect(found, PICTURE[0])
+
+
+def draw_size_effect(found: dict[str, FloatArray], path: Path) -> None:
+    """Draw critical strains and stresses over the number of cells."""
+    made, n = figure(7.4, 3.3), list(REFERENCE)
+    panels, (low, high) = made.subplots(1, 2), (found["direct"].min(1), found["direct"].max(1))
+    looks = dict(zip([*MODES, "first order"], ((BLUE, "o-"), (GREEN, "s-"), (RED, "^--"),
+                                               (GOLD, ":")), strict=True))  # fmt: skip
+    for axes, columns, scale in zip(panels, ((0,), (1, 2)), (100, 1000), strict=True):
+        for column in columns:
+            middle = scale * found["direct"].mean(axis=1)[:, column]
+            span = scale * np.stack([low[:, column], high[:, column]]) - middle
+            axes.errorbar(n, middle, np.abs(span), color="black", marker="D", ms=4, lw=1.2,
+                          capsize=2.5, label="direct, mean and both positions")  # fmt: skip
+            for kind, (colour, line) in looks.items():
+                axes.plot(n, scale * found[kind][:, column], line, color=colour, ms=3.5, lw=1.2,
+                          label=f"micromorphic, {kind}" if kind in MODES else kind)  # fmt: skip
+            if column:
+                text, place = f"at {STRESSES[column - 1]:.0%}", (n[0] + 0.4, middle[0])
+                axes.annotate(text, place, color="black", fontsize=7.5)
+        axes.set(xlabel="cells between the plates", xticks=n)
+        axes.grid(alpha=0.25)
+    panels[0].set_ylabel("critical strain [%]")
+    panels[1].set_ylabel("nominal stress [kPa]")
+    handles, labels = panels[0].get_legend_handles_labels()
+    made.legend(handles, labels, frameon=False, loc="upper center", ncols=3, fontsize=7.5)
+    made.tight_layout(rect=(0, 0, 1, 0.86))
+    made.patch.set_facecolor("white")
+    with atomic(path) as temporary:
+        made.savefig(temporary, format="png", dpi=150, facecolor="white")
 
 
 def homogenized_specimen(
@@ -537,6 +607,8 @@ def cost() -> None:
         before = before or peak
 
 
+PICTURE: list[Path] = []
+"""Where to draw the size effect, if anywhere."""
 SECTIONS: dict[str, Callable[[], None]] = {
     "cell": cell, "strips": strips, "specimen": specimen, "choices": choices,
     "positions": positions, "flower": flower, "loads": loads, "triangular": triangular,
@@ -549,7 +621,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("section", nargs="*", help=", ".join(SECTIONS))
-    for name in parser.parse_args().section or SECTIONS:
+    parser.add_argument("--picture", type=Path, help="where to draw the size effect (PNG)")
+    options = parser.parse_args()
+    PICTURE[:] = [options.picture] if options.picture else []
+    for name in options.section or SECTIONS:
         SECTIONS[name]()
 
 
