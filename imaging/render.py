@@ -191,12 +191,11 @@ def _add(
     rows, cols = selected.shape
     where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
     shown, work = np.empty(BLOCK), workspace()
+    element, at = np.empty(_BAND * cols, dtype=np.int32), np.empty((2, _BAND * cols))
     for band in range(thread, start.size - 1, threads):
         top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
         if first[band] == first[band + 1]:
             continue
-        size = (bottom - top) * cols
-        element, at = np.empty(size, dtype=np.int32), np.empty((2, size))
         pixels = Pixels(element, at, np.empty(0, dtype=np.float32), top, cols, 0.0, 0.0, 1.0)
         visited = visits[start[band] : start[band + 1]]
         fill(elements, place, pixels, selected.ravel(), visited, top, bottom)
