@@ -116,6 +116,8 @@ def test_a_supercell_that_is_meshed_anew_for_each_hole_is_refused_with_what_to_d
         primitive_cell(made.square_four())
     with pytest.raises(InputError, match=r"supercell of 2 .*\[0.5, 0.866025404\]\] mm, or set pr"):
         primitive_cell(made.hexagonal_two())
+    (note,) = primitive_cell(made.square_four(), wanted=False).notes
+    assert note.endswith("without bifurcation: each is meshed differently")
 
 
 # -- sets that the mesh splits ---------------------------------------------------------------

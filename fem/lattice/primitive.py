@@ -30,9 +30,8 @@ def primitive_cell(cell: UnitCell, wanted: bool = True) -> UnitCell:
         return cell
     text = f"[{', '.join(f'[{x:.9g}, {y:.9g}]' for x, y in vectors)}]"
     if not wanted:
-        note = (
-            f"the cell holds {count} primitive ones, vectors = {text} mm: modes may mix their waves"
-        )
+        note = f"the cell holds {count} primitive ones, vectors = {text} mm: modes may mix waves"
+        note += "" if _is_uniform(cell) else ", and without bifurcation: each is meshed differently"
         return replace(cell, notes=(*cell.notes, note))
     if not _is_uniform(cell):
         raise InputError(
