@@ -126,6 +126,7 @@ def pytest_configure(config: pytest.Config) -> None:
         import numba
 
         numba.set_num_threads(1)
+        gc.disable()  # until all tests are imported
 
 
 _compiling = pytest.StashKey[list[int]]()
@@ -156,12 +157,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Wait for those who compile; keep what the imports left out of all collections of garbage."""
+    """Wait for those who compile; keep what the imports left out of all collections of garbage.
+
+    From now on these are rare: most of what they would look through is matplotlib's, and little.
+    """
     for pid in getattr(session.config, "workerinput", {}).get("compiling", ()):
         while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
             time.sleep(0.1)
-    gc.collect()
     gc.freeze()
+    gc.set_threshold(100_000, 20, 100)
+    gc.enable()
 
 
 def pytest_sessionfinish() -> None:

@@ -119,6 +119,7 @@ def test_what_was_missed_is_said(text: str) -> None:
     assert missed in text.replace("\N{NO-BREAK SPACE}", " ")
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_one_snapshot_before_buckling_is_enough(tmp_path: Path) -> None:
     data = made_up.data((0.05,))
     text = report(data, tmp_path, made_up.summary(data))
@@ -127,6 +128,7 @@ def test_one_snapshot_before_buckling_is_enough(tmp_path: Path) -> None:
     assert "After buckling" not in text
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_a_solution_from_elsewhere_has_no_path(tmp_path: Path) -> None:
     data = made_up.data((0.05,))
     data = replace(data, solution=made_up.solution((0.05,), {"source": "mesh.vtu"}))
@@ -139,6 +141,7 @@ def test_a_solution_from_elsewhere_has_no_path(tmp_path: Path) -> None:
     assert "none found" in text
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_a_specimen_that_stays_stable_has_no_critical_point(tmp_path: Path) -> None:
     data = made_up.data((0.05,))
     info = {"critical": None, "path": {"primary": made_up.PATH["primary"]}}
@@ -148,6 +151,7 @@ def test_a_specimen_that_stays_stable_has_no_critical_point(tmp_path: Path) -> N
     assert "load" in Page(text).ids
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_a_correlation_without_a_mode_has_no_panels_of_it(tmp_path: Path) -> None:
     plain = Ansatz(made_up.DOMAIN, (), v0_degree=3)
     data = made_up.data((0.05,), plain)
@@ -158,6 +162,7 @@ def test_a_correlation_without_a_mode_has_no_panels_of_it(tmp_path: Path) -> Non
     assert "mode" not in ids
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_progress_is_told_up_to_the_end() -> None:
     told: list[float] = []
     figures = experiment_figures(made_up.data((0.05,)))

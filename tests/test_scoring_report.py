@@ -148,6 +148,7 @@ def test_the_page_is_whole_and_loads_nothing(command: tuple[Path, str, int]) -> 
         assert all(page.ids[f"{kind}-{n}"] == 1 for kind in ("length", "x", "y"))
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_a_perfect_field_alone_gets_its_page(
     truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,6 +164,7 @@ def test_a_perfect_field_alone_gets_its_page(
     assert "where all measure" not in text
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_a_field_that_lost_all_of_the_material_gets_its_page(
     truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,6 +193,7 @@ def test_bad_input_is_one_line(
     assert not (tmp_path / "out" / "report.html").exists()
 
 
+@pytest.mark.usefixtures("unrendered_pictures")
 def test_fields_that_cannot_be_graded_do_not_stop_the_others(
     truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
