@@ -169,20 +169,10 @@ def render_observed(state: ImagedState, points: Positions) -> Rendering:
 
 @compiled()
 def _add(
-    elements: ElementTable,
-    place: FloatArray,
-    pattern: SplineTable,
-    background: float,
-    start: IntArray,
-    visits: IntArray,
-    weight: float,
-    selected: BoolArray,
-    chosen: IntArray,
-    first: IntArray,
-    total: FloatArray,
-    thread: int,
-    threads: int,
-) -> None:
+    elements: ElementTable, place: FloatArray, pattern: SplineTable, background: float,
+    start: IntArray, visits: IntArray, weight: float, selected: BoolArray, chosen: IntArray,
+    first: IntArray, total: FloatArray, thread: int, threads: int,
+) -> None:  # fmt: skip
     """Add a weight times the selected pixels' grey levels to ``total`` (k,).
 
     ``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are. ``chosen``

@@ -237,7 +237,8 @@ def test_where_every_correlation_is_trapped_the_refitted_ansatz_is_the_result(
         right = correlate(*given, **named)
         return replace(right, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.9 * right.unknowns)
 
-    monkeypatch.setattr("modeharvest.idic.photograph.measure.correlate", trapped)
+    for module in ("photograph.measure", "finite_element.result"):
+        monkeypatch.setattr(f"modeharvest.idic.{module}.correlate", trapped)
     found = harvest(experiment(photographs), tmp_path, whole_field=True)
     for frame in found["frames"]:
         name = frame["name"]

@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 import tifffile
 from manufactured import inverted, speckle
-from plate_with_hole import GRID, plate_pair
+from plate_with_hole import GRID, plate_pair, quadratic_field
 from test_cli import called, error_line
 
 from modeharvest.idic.finite_element.files import Given, read_result, write_csv, write_result
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field
-from modeharvest.idic.photograph.displacement import block_motion
+from modeharvest.idic.photograph.displacement import block_motion, displacement_from
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import write_image
@@ -238,12 +240,46 @@ def test_start_follows_what_no_polynomial_does() -> None:
     before = inverted(wave, at, 1e-9)
     pair = ImagePair(*(pattern(x[..., 0], x[..., 1]) for x in (at, before)), grid)
     mesh = mesh_of_mask(pair.masks[0], grid, 24.0, 24.0).mesh
-    start = block_motion(pair, mesh, 0.0 * mesh.nodes)
+    start = block_motion(pair, Body(mesh), 0.0 * mesh.nodes)
     off = np.linalg.norm(start - wave(mesh.nodes), axis=1) / grid.pixel_size
     inner = (abs(mesh.nodes) < 0.8).all(axis=1)  # where there are blocks on all sides
     # Whole pixels, and a block of 41 px is blind to a tenth of such a wave's 8 px.
     assert np.median(off[inner]) < 1.5
     assert np.quantile(off[inner], 0.99) < 4.0
+
+
+def error_from(off_px: float, brightness: int = 0, light: float = 0.0) -> np.ndarray:
+    """(p, 2) errors on the plate [px], where nothing is known of the deformed image.
+
+    The start is a wave of 60 px off; the light grows along x in the deformed image by a share.
+    """
+    exact = plate_pair(quadratic_field, 0.004)
+    mask, slope = exact.masks[0], 1.0 + light * GRID.x / GRID.x.max()
+    pair = ImagePair(255 * exact.reference, 255 * slope * exact.deformed, GRID, mask)
+    body = FiniteElementOptions().body(mask, GRID)
+    phase = 2.0 * np.pi / 0.6 * body.mesh.nodes[:, ::-1]
+    wave = off_px * GRID.pixel_size * np.column_stack([np.cos(phase[:, 0]), np.sin(phase[:, 1])])
+    start = quadratic_field(body.mesh.nodes) + wave
+    found = displacement_from(start, pair, body, light_degree=brightness).displacement_on()
+    assert exact.truth is not None
+    return (found - exact.truth.displacement)[mask] / GRID.pixel_size
+
+
+def test_edges_are_found_from_a_start_that_is_far_off() -> None:
+    """A mask that holds some background made single nodes run away, here by 7 px."""
+    error = error_from(4.0)
+    assert np.isfinite(error).all()
+    assert np.sqrt(np.mean(error**2)) < 0.06
+    assert np.linalg.norm(error, axis=1).max() < 1.0
+
+
+def test_light_that_changes_along_the_image_does_not_enter_the_displacement() -> None:
+    without, ignored, found = (
+        np.sqrt(np.mean(error_from(2.0, degree, light) ** 2))
+        for degree, light in ((0, 0.0), (0, 0.05), (2, 0.05))
+    )
+    assert ignored > 3.0 * without
+    assert found < 1.4 * without
 
 
 @pytest.mark.usefixtures("undrawn_pictures")

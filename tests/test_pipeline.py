@@ -23,10 +23,13 @@ from modeharvest.cli.root import main
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.idic.correlate import correlate
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import quadratic
 from modeharvest.idic.finite_element.system import Body
+from modeharvest.idic.result import Result
+from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.runs import run, whole_field
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
@@ -150,6 +153,40 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
     shutil.rmtree(folder / "whole_field")
     Run(whole, folder).measure()
     assert [path.read_bytes() for path in measured] == content
+
+
+def test_where_the_correlation_is_trapped_the_refitted_unknowns_are_the_result(
+    case: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And they are the trapped one's again where the whole displacement is left out."""
+
+    def trapped(*given: Any, **named: Any) -> Result:
+        right = correlate(*given, **named)
+        off = right.ansatz.initial_guess(0.0, 1.0)
+        return replace(right, outcome=Outcome.LOCAL_MINIMUM, unknowns=right.unknowns + 0.2 * off)
+
+    for module in ("runs.experiment", "idic.finite_element.result"):
+        monkeypatch.setattr(f"modeharvest.{module}.correlate", trapped)
+    monkeypatch.setattr(whole_field, "get_num_threads", lambda: 1)
+    shutil.rmtree(folder / "correlation")
+    where = case, "--out", folder
+    assert called(monkeypatch, "correlate", *where) == 0
+    assert capsys.readouterr().out.count("local_minimum") == 2 * 2  # name and value
+    assert called(monkeypatch, "correlate", *where, "--whole-field") == 0
+    assert capsys.readouterr().out.count("refitted") == 2 * 2
+    assert called(monkeypatch, "validate", *where, "--whole-field") == 0
+    capsys.readouterr()
+    for snapshot in read_json(folder / "summary.json")["snapshots"]:
+        name = f"displacement_{round(1e4 * snapshot['nominal_strain']):04d}"
+        result = Result.read(folder / "whole_field" / f"{name}_result.json")
+        assert snapshot["outcome"] == "refitted"
+        off = snapshot["whole_field"]["rms_refit_to_best_fit_px"]
+        assert snapshot["rms_idic_to_best_fit_px"] == pytest.approx(off, rel=0.05)
+        assert off < 0.1
+        assert result.outcome is Outcome.REFITTED
+    assert "refitted to the measured whole displacement" in (folder / "report.html").read_text()
+    assert called(monkeypatch, "correlate", *where) == 0
+    assert capsys.readouterr().out.count("local_minimum") == 2 * 2
 
 
 Share = Callable[[Progress], None]

@@ -214,3 +214,16 @@ def test_error_bars_by_noise_in_either_image(noise: tuple[float, float]) -> None
         ratios.append(np.median((error / found.noise_deviation) ** 2))
     # The median of F(1, 16), of which standard deviations by 16 samples are; scatter 4 %.
     assert 0.88 < np.mean(ratios) / 0.476 < 1.15
+
+
+@pytest.mark.parametrize(("wavelength_px", "left", "within"), [(200, 1.0, 0.05), (45, 0.0, 0.2)])
+def test_a_start_is_smoothed_by_its_cut_off_wavelength(
+    wavelength_px: int, left: float, within: float
+) -> None:
+    """Of a wave 1/(1 + (80/wavelength)^6) is left, as far as quadratic elements can tell it."""
+    body = COARSE.body(np.ones(GRID.shape, dtype=np.bool_), GRID)
+    k, x = 2.0 * np.pi / (wavelength_px * GRID.pixel_size), body.mesh.nodes
+    wave = np.column_stack([np.cos(k * x[:, 1]), np.sin(k * x[:, 0])])
+    inner = (abs(x) < 0.5).all(axis=1)
+    found = body.smoothed(wave, 80.0 * GRID.pixel_size)
+    assert abs(found - left * wave)[inner].max() < within

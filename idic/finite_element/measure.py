@@ -166,9 +166,9 @@ def measure_displacement(
 def coarse_displacement(
     pair: ImagePair, start: Start, on: Body, *, options: FiniteElementOptions
 ) -> FloatArray:
-    """(n, 2) u [mm] after the stages before the last; for the rest see `measure_displacement`."""
+    """(n, 2) u [mm] before the last cut-off is sought; for the rest see `measure_displacement`."""
     course = _Measurement(pair, start, on, options)
-    for stage in _STAGES:
+    for stage in (*_STAGES, _Stage(FULL, _FIRST_PX)):
         course.through(stage)
     return course.u.reshape(-1, 2)
 

@@ -13,17 +13,20 @@ from scipy import ndimage
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.correlate import ASTRAY, correlate, fit_displacement, refitted_result
 from modeharvest.idic.finite_element.cutoff import Risk
 from modeharvest.idic.finite_element.fields import deviation_of, field_of, nodal_gradient
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.elements import shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
 
 _BEYOND_PX = 2.0
 """How far beyond the mesh's edge its fields are continued: the edge is known to half a pixel."""
@@ -199,6 +202,27 @@ def refitted(measured: NodalResult, ansatz: Ansatz, guess: FloatArray, mask: Boo
     """An ansatz, fitted to what was measured on the pixels of a mask; ``guess``: (n,) unknowns."""
     u = measured.displacement_on()
     return fit_displacement(u, measured.grid, ansatz, guess, mask & np.isfinite(u[..., 0]))
+
+
+def refitted_correlation(
+    measured: NodalResult,
+    pair: ImagePair,
+    ansatz: Ansatz,
+    guess: FloatArray,
+    mask: BoolArray,
+    options: CorrelationOptions,
+    progress: Progress = silent,
+) -> tuple[Result, Result]:
+    """Correlate from an ansatz :func:`refitted` to what was measured; the result, and the refit.
+
+    Where the correlation ends astray the refit is the result, with the outcome REFITTED.
+    """
+    refit = refitted(measured, ansatz, guess, mask)
+    a = np.append(refit.unknowns, guess[refit.unknowns.size :])
+    found = correlate(pair, ansatz, guess=a, options=options, progress=progress)
+    if found.outcome in ASTRAY:
+        found = refitted_result(pair, ansatz, a, options)
+    return found, refit
 
 
 def _continue(

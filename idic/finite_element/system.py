@@ -252,6 +252,14 @@ class Body:
         self._factorised = M, R, weight
         return self._factor
 
+    def smoothed(self, u: FloatArray, cutoff: float) -> FloatArray:
+        """(n, 2) a displacement less its waves shorter than a cut-off wavelength [mm]."""
+        one, R = csr_array(diags_array(np.ones(u.size))), self.smoothness
+        weight = (cutoff / self.wavelength) ** Smoothness.power * self.energies(one)
+        if not R.data.any():  # a single element
+            return u
+        return self.factor(one, R, weight / self.energies(R)).solve(u.ravel()).reshape(-1, 2)
+
     def samples(self, blocks: FloatArray) -> FloatArray:
         """(2 n, SAMPLES) random vectors of the covariance M, given by its blocks."""
         n, m, count = len(self.mesh.nodes), len(blocks), SAMPLES

@@ -16,7 +16,7 @@ from scipy.ndimage import label, mean
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.chebyshev import Box, ChebyshevField
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
     coarse_displacement,
@@ -54,6 +54,8 @@ _CLOSE_PX = 1.5
 _DENSER = 5, 16
 """Times as many blocks, in turn, that are asked: the widest places are junctions, which only turn.
 """
+_SMOOTH_PX = 60.0
+"""Shorter waves of a start are what a spline makes of whole pixels, and would stay."""
 _STRAY = 8.0
 """Times the spread of its neighbours' motion that a block may be off their median."""
 _FIRST = FiniteElementOptions(edge_px=4)
@@ -64,8 +66,12 @@ _BLUR_PX, _SPECKLE = 1.5, 3.0
 """Of the reference, and the power of its slopes over that of noise, where there is speckle."""
 _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which they don't match."""
-_OFF_PX = 4.0, 1.0
-"""By how much edges may be off where blocks of speckle, and a first measurement, say they are."""
+_OFF_PX, _AT_EDGE_PX = (4.0, 2.0), 1.0
+"""By how much edges may be off where blocks of speckle, a first and a second measurement say."""
+_UNLIKE, _ROUNDS = 4.5, 4
+"""Residual over its median, 3 standard deviations of noise, beyond which pixels don't match."""
+_SAMPLES, _LEAST = 100_000, 0.1
+"""Pixels that tell how brightness varies; least contrast anywhere, of the mean."""
 
 
 def displacement_from(
@@ -74,20 +80,26 @@ def displacement_from(
     body: Body,
     options: FiniteElementOptions = _LAST,
     progress: Progress = silent,
+    light_degree: int = 0,
 ) -> NodalResult:
     """Measure the displacement of a photograph on a mesh, from a start (n, 2) at its nodes [mm].
 
     ``pair``: the mask of the reference; brightness may differ. InputError if the images don't
     overlap; and as for :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
+    ``light_degree``: of the polynomials by which gain and offset vary over the reference.
     """
-    mesh = body.mesh
-    pair = _alike(pair, mesh, start)
-    if pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None:
-        inner = replace(pair, deformed_mask=deformed_mask(pair.grid, mesh, start, _OFF_PX[0]))
-        first = coarse_displacement(inner, start, body, options=_FIRST)
-        mask = deformed_mask(pair.grid, mesh, first, _OFF_PX[1])
-        pair = replace(_alike(pair, mesh, first), deformed_mask=mask)
-    return measure_displacement(pair, start, body, options=options, progress=progress)
+    mesh, u = body.mesh, start
+    is_sought = pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None
+
+    def seen(off_px: float) -> ImagePair:
+        """The images alike, less what shows background where edges are off by so much."""
+        alike = _alike(pair, mesh, u, light_degree)
+        mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
+        return replace(alike, deformed_mask=mask)
+
+    for off_px in _OFF_PX if is_sought or light_degree else ():
+        u = coarse_displacement(seen(off_px), start, body, options=_FIRST)
+    return measure_displacement(seen(_AT_EDGE_PX), start, body, options=options, progress=progress)
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:
@@ -118,7 +130,7 @@ def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, 
 
 
 def block_motion(
-    pair: ImagePair, mesh: Mesh, known: FloatArray, names: Sequence[str] = ()
+    pair: ImagePair, body: Body, known: FloatArray, names: Sequence[str] = ()
 ) -> FloatArray:
     """(n, 2) displacement of the nodes [mm] to some pixels: what is known, and what blocks moved.
 
@@ -126,6 +138,7 @@ def block_motion(
     (n, 2); where that isn't close to them, a spline through more of them takes its place.
     InputError if they aren't found.
     """
+    mesh = body.mesh
     match = _matched(pair, mesh, known, BLOCKS)
     require_same_surface(match, *names)
     added = match.in_mm(pair.grid).less(_at_nearest(mesh, known))
@@ -139,7 +152,7 @@ def block_motion(
         keep = _like_neighbours(left, pair.grid.pixel_size)
         spline = RBFInterpolator(left.points[keep], left.u[keep], neighbors=30)
         known = known + spline(mesh.nodes)
-    return known
+    return body.smoothed(known, _SMOOTH_PX * pair.grid.pixel_size)
 
 
 def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:
@@ -181,34 +194,53 @@ def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) ->
     return inner if inner.any() else None
 
 
-def _alike(pair: ImagePair, mesh: Mesh, u: FloatArray) -> ImagePair:
-    """The pair, the deformed image's brightness and contrast turned to the reference's."""
+def _alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
+    """The pair with its brightness and contrast alike, in the reference's grey levels."""
     at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
-    gain, offset = brightness(pair, np.moveaxis(at, 0, -1))
-    return pair.with_images(pair.reference, gain * pair.deformed + offset)
+    gain, offset = brightness(pair, np.moveaxis(at, 0, -1), degree)
+    a, b = gain.mean(), offset.mean()
+    reference = a * (pair.reference - offset) / gain + b
+    return pair.with_images(reference.astype(np.float32), a * pair.deformed + b)
 
 
-def brightness(pair: ImagePair, u: FloatArray) -> tuple[float, float]:
-    """Gain [-] and offset [grey levels] that give g(x + u) the mean and the contrast of f.
+def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Gain [-] and offset [grey levels], (rows, cols), that make g(x + u) as bright as f.
 
-    ``u`` (rows, cols, 2) [mm], NaN where it isn't known. Edges don't count.
+    Both have the same mean and the same contrast, polynomials of a degree fitted to the pixels: so
+    a displacement that is off by some pixels hardly matters. Edges and what doesn't match don't
+    count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known.
     """
-    inner = shrunk(pair.masks[0], _OFF_PX[0])
-    f, g = _compared(pair, u, inner if inner.any() else pair.masks[0])
-    there = np.isfinite(g)
-    if not there.any() or not g[there].std() > 0.0:
+    grid, inner = pair.grid, shrunk(pair.masks[0], _OFF_PX[0])
+    inner = (inner if inner.any() else pair.masks[0]) & np.isfinite(u).all(axis=-1)
+    every = max(1, int(inner.sum() / _SAMPLES))
+    both = np.stack([part[::every] for part in _compared(pair, u, inner)], axis=1, dtype=float)
+    there = np.isfinite(both[:, 1])
+    if not there.any() or not np.ptp(both[there, 1]) > 0.0:
         raise InputError("expected pixels of the material in both images, got none in common")
-    gain = float(f[there].std(dtype=np.float64) / g[there].std(dtype=np.float64))
-    return gain, float(f[there].mean(dtype=np.float64) - gain * g[there].mean(dtype=np.float64))
+    field = ChebyshevField(Box(*grid.x[[0, -1]], *grid.y[[-1, 0]]), degree)
+    row, col = (places[::every] for places in np.nonzero(inner))
+    basis = field.basis(grid.x[col], grid.y[row])
+    for _ in range(_ROUNDS):
+        mean = np.linalg.lstsq(basis[there], both[there])[0]
+        less = both - basis @ mean
+        contrast = np.linalg.lstsq(basis[there], np.abs(less[there]))[0]
+        seen = basis @ contrast
+        off = np.abs(less[:, 0] - seen[:, 0] / seen[:, 1] * less[:, 1])
+        there = off <= _UNLIKE * np.nanmedian(off)
+    f, g, *contrasts = (
+        field.evaluate(part, grid.x[None], grid.y[:, None]) for part in (*mean.T, *contrast.T)
+    )
+    gain = np.divide(*(np.maximum(part, _LEAST * part.mean()) for part in contrasts))
+    return gain, f - gain * g
 
 
-def residual(pair: ImagePair, u: FloatArray) -> FloatArray:
+def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
     """(rows, cols) f - gain g(x + u) - offset [grey levels]; NaN off the material and the image."""
-    gain, offset = brightness(pair, u)
+    gain, offset = brightness(pair, u, degree)
     known = pair.masks[0] & np.isfinite(u).all(axis=-1)
     f, g = _compared(pair, u, known)
     found = np.full(pair.grid.shape, np.nan)
-    found[known] = f - gain * g - offset
+    found[known] = f - gain[known] * g - offset[known]
     return found
 
 

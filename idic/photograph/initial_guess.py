@@ -71,16 +71,11 @@ class InitialGuess:
 
 
 def initial_guess(
-    pair: ImagePair,
-    cell_size: float,
-    cellular: Box | Sequence[Box],
-    *,
-    local: LocalField | None = None,
-    holes: LocalField | None = None,
-    lattice: ArrayLike | None = None,
-    domain: Box | None = None,
+    pair: ImagePair, cell_size: float, cellular: Box | Sequence[Box], *,
+    local: LocalField | None = None, holes: LocalField | None = None,
+    lattice: ArrayLike | None = None, domain: Box | None = None,
     options: AnsatzOptions | None = None,
-) -> InitialGuess:
+) -> InitialGuess:  # fmt: skip
     """Find ansatz and initial guess for a pair of images.
 
     InputError if the holes or the spectrum contradict the cell size.

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.correlate import ASTRAY, correlate, refitted_result
+from modeharvest.idic.correlate import ASTRAY, correlate
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.result import WholeField, refitted
+from modeharvest.idic.finite_element.result import WholeField, refitted, refitted_correlation
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion
@@ -165,16 +165,10 @@ def measure(
 
 
 def measure_whole(
-    pair: ImagePair,
-    geometry: Geometry,
-    cell_size: float,
-    how: PhotographOptions,
-    first: MeasuredPhotograph,
-    body: Body,
-    on_mesh: FiniteElementOptions,
-    camera: CameraNoise,
+    pair: ImagePair, geometry: Geometry, cell_size: float, how: PhotographOptions,
+    first: MeasuredPhotograph, body: Body, on_mesh: FiniteElementOptions, camera: CameraNoise,
     progress: Progress = silent,
-) -> MeasuredPhotograph:
+) -> MeasuredPhotograph:  # fmt: skip
     """Measure the whole displacement of a photograph that was correlated, and the modes in it.
 
     The measurement starts from the correlation, or from blocks of the speckle where that ended
@@ -191,7 +185,7 @@ def measure_whole(
     else:
         start, lit = "blocks of the speckle", pair
         slow, _ = first_motion(geometry.region.domain, pair, first.local)
-        begin = block_motion(pair, mesh, slow(mesh.nodes))
+        begin = block_motion(pair, body, slow(mesh.nodes))
     measured = displacement_from(begin, lit, body, on_mesh, progress)
     noise = image_noise(pair, camera)
     expected = float(np.hypot(noise.reference, noise.deformed))
@@ -208,19 +202,17 @@ def measure_whole(
         refit = refitted(measured, found.ansatz, found.unknowns, mask)
         text = (*first.text, "The spectra of the whole displacement show no other waves.")
     else:
-        refit = refitted(measured, ansatz, unknowns, mask)
-        unknowns[: refit.unknowns.size] = refit.unknowns
-        found = correlate(pair, ansatz, guess=unknowns, options=how.options(), progress=progress)
-        assert found.final_smoothing is not None  # as asked for by how.options()
+        found, refit = refitted_correlation(
+            measured, pair, ansatz, unknowns, mask, how.options(), progress
+        )
         text = (
             first.text[0],
             *_guess_text(guess, ansatz, geometry),
             f"A first correlation, of other modes, ended as “{first.result.outcome.value}”; this "
             "one started from the ansatz fitted to the whole displacement.",
-            found.final_smoothing.text,
+            *([found.final_smoothing.text] if found.final_smoothing else ()),
         )
-        if found.outcome in ASTRAY:
-            found = refitted_result(pair, ansatz, unknowns, how.options())
+        if found.outcome is Outcome.REFITTED:
             warnings = (*warnings, _REFITTED)
     whole = WholeField(measured, refit, start=start)
     return MeasuredPhotograph(found, guess.local, text, whole, warnings)

@@ -125,11 +125,6 @@ class LevelSearch:
     def _all_pixels(self) -> Assembly:
         return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
 
-    @cached_property
-    def _material(self) -> NDArray[np.int64]:
-        """(rows,) pixels of the level's mask."""
-        return np.asarray(np.count_nonzero(self.pair.mask, axis=1))
-
     def _thinned(self, assembly: Assembly) -> Assembly:
         """One row of a few, if that leaves plenty of pixels."""
         if assembly.runs.pixels < _STRIDE * _PLENTY * self.ansatz.size:
@@ -153,7 +148,8 @@ class LevelSearch:
         """
         limits, factor = self.options, self.level.factor
         rows = np.diff(assembly.runs.row_start) > 0 if assembly.runs.pixels else slice(None)
-        kept = (assembly.runs.pixels + assembly.outside) / max(1, self._material[rows].sum())
+        material = max(1, np.count_nonzero(self.pair.mask[rows]))
+        kept = (assembly.runs.pixels + assembly.outside) / material
         most = min(1.0, limits.max_outside / kept) if kept > 0 else limits.max_outside
         tolerance = limits.coarse_tolerance_px * factor if leads else limits.tolerance_px
         return minimise(

@@ -90,24 +90,15 @@ def warp_pass(
                     outside[band] += _mark_valid(n, own, valid, kept[row])
                 elif left.shape[0] == 2:
                     for k in range(2):
-                        _place(n, own, own[U_X + k], left[k, row])
+                        for m in range(n):
+                            left[k, row, int(own[COLUMN, m])] = own[U_X + k, m]
                 else:
                     sample_block(target, row, n, block)
                     for k in range(left.shape[0]):
-                        _put(n, own, E[k + 3 - left.shape[0]], left[k, row])
-
-
-@compiled(relaxed=True)
-def _put(n: int, own: Any, values: Any, to: Any) -> None:
-    for m in range(n):
-        if own[WEIGHT, m] > 0.0:
-            to[int(own[COLUMN, m])] = values[m]
-
-
-@compiled(relaxed=True)
-def _place(n: int, own: Any, values: Any, to: Any) -> None:
-    for m in range(n):
-        to[int(own[COLUMN, m])] = values[m]
+                        for m in range(n):
+                            if own[WEIGHT, m] > 0.0:
+                                at = int(own[COLUMN, m])
+                                left[k, row, at] = E[k + 3 - left.shape[0], m]
 
 
 @compiled(relaxed=True)

@@ -115,15 +115,9 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
 
 @compiled(relaxed=True)
 def _prove(
-    positions: FloatArray,
-    cells: IntArray,
-    slopes: FloatArray,
-    convert: FloatArray,
-    coefficients: FloatArray,
-    proved: BoolArray,
-    thread: int,
-    threads: int,
-) -> None:
+    positions: FloatArray, cells: IntArray, slopes: FloatArray, convert: FloatArray,
+    coefficients: FloatArray, proved: BoolArray, thread: int, threads: int,
+) -> None:  # fmt: skip
     """Bernstein coefficients of every determinant, and whether all are positive.
 
     ``slopes`` (2, q, k): derivatives of the shape functions at the lattice's points.

@@ -113,15 +113,9 @@ def _enlarged_slopes(reference: ReferenceElement, beyond: float) -> FloatArray:
 
 @compiled(relaxed=True)
 def _tabulate(
-    elements: ElementTable,
-    nodes: FloatArray,
-    position_px: FloatArray,
-    cells: IntArray,
-    coefficients: FloatArray,
-    rows: int,
-    thread: int,
-    threads: int,
-) -> None:
+    elements: ElementTable, nodes: FloatArray, position_px: FloatArray, cells: IntArray,
+    coefficients: FloatArray, rows: int, thread: int, threads: int,
+) -> None:  # fmt: skip
     """Fill in the elements: centres, polynomials, sides, and the image rows they reach into."""
     for e in range(thread, len(cells), threads):
         cell, centre = cells[e], elements.centres[e]

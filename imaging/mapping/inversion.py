@@ -82,15 +82,9 @@ def outside(triangular: bool, s: float, t: float) -> float:
 
 @compiled(relaxed=True)
 def invert(
-    polynomial: FloatArray,
-    triangular: bool,
-    affine: bool,
-    row: FloatArray,
-    col: FloatArray,
-    s: FloatArray,
-    t: FloatArray,
-    count: int,
-) -> None:
+    polynomial: FloatArray, triangular: bool, affine: bool, row: FloatArray, col: FloatArray,
+    s: FloatArray, t: FloatArray, count: int,
+) -> None:  # fmt: skip
     """Solve position(s, t) = (row, col) for ``count`` pixels from s, t; it may be wrong."""
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
     curved = not triangular
@@ -166,13 +160,9 @@ def _may_hold(
 
 @compiled()
 def search(
-    polynomial: FloatArray,
-    bezier: FloatArray,
-    quarters: FloatArray,
-    triangular: bool,
-    row: float,
+    polynomial: FloatArray, bezier: FloatArray, quarters: FloatArray, triangular: bool, row: float,
     col: float,
-) -> tuple[bool, float, float]:
+) -> tuple[bool, float, float]:  # fmt: skip
     """Exhaustive search: halve the element, drop parts that can't hold the pixel, try the rest."""
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
     stack = np.empty((4 * _DEEPEST + 4, 4))
@@ -271,14 +261,9 @@ def _roots(a: float, b: float, c: float) -> tuple[float, float]:
 
 @compiled(inline=True, relaxed=True)
 def start_cubic(
-    polynomial: FloatArray,
-    curved: bool,
-    low: End,
-    high: End,
-    col: float,
-    s: FloatArray,
+    polynomial: FloatArray, curved: bool, low: End, high: End, col: float, s: FloatArray,
     t: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Start for the pixels col, col + 1, ... of a row between its two ends."""
     length = max(high[0] - low[0], 1e-3)
     ds_low, dt_low = _along_row(polynomial, curved, low[1], low[2])

@@ -192,17 +192,10 @@ def _buckets(elements: ElementTable) -> _Buckets:
 
 @compiled()
 def _locate(
-    elements: ElementTable,
-    buckets: _Buckets,
-    row: FloatArray,
-    col: FloatArray,
-    frame: tuple[float, float, float],
-    owner: NDArray[np.int32],
-    xi: FloatArray,
-    residual: NDArray[np.float32],
-    thread: int,
-    threads: int,
-) -> None:
+    elements: ElementTable, buckets: _Buckets, row: FloatArray, col: FloatArray,
+    frame: tuple[float, float, float], owner: NDArray[np.int32], xi: FloatArray,
+    residual: NDArray[np.float32], thread: int, threads: int,
+) -> None:  # fmt: skip
     """Fill owner, xi and residual; a thread writes its own points only."""
     x0, y0, h = frame
     for block in range(thread, (row.size + _BLOCK - 1) // _BLOCK, threads):

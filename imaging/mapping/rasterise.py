@@ -67,15 +67,9 @@ class Batch(NamedTuple):
 
 @compiled()
 def rasterise(
-    elements: ElementTable,
-    fields: FloatArray,
-    pixels: Pixels,
-    start: IntArray,
-    visits: IntArray,
-    overlapping: IntArray,
-    thread: int,
-    threads: int,
-) -> None:
+    elements: ElementTable, fields: FloatArray, pixels: Pixels, start: IntArray, visits: IntArray,
+    overlapping: IntArray, thread: int, threads: int,
+) -> None:  # fmt: skip
     """Fill ``pixels``, a whole image, and count those that lie inside more than one element.
 
     ``fields`` (m, c, 9) are polynomials over the elements; without any (c = 0) the values are
@@ -92,14 +86,9 @@ def rasterise(
 
 @compiled()
 def fill(
-    elements: ElementTable,
-    fields: FloatArray,
-    pixels: Pixels,
-    selected: BoolArray,
-    visited: IntArray,
-    top: int,
-    bottom: int,
-) -> int:
+    elements: ElementTable, fields: FloatArray, pixels: Pixels, selected: BoolArray,
+    visited: IntArray, top: int, bottom: int,
+) -> int:  # fmt: skip
     """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many lie in two elements.
 
     That is counted with residuals alone. ``selected`` (n,) tells of a whole image's pixels where to
@@ -159,15 +148,9 @@ def fill(
 
 @compiled(inline=True)
 def _assign(
-    elements: ElementTable,
-    fields: FloatArray,
-    pixels: Pixels,
-    e: int,
-    state: NDArray[np.uint8],
-    begin: int,
-    batch: Batch,
-    count: int,
-) -> None:
+    elements: ElementTable, fields: FloatArray, pixels: Pixels, e: int, state: NDArray[np.uint8],
+    begin: int, batch: Batch, count: int,
+) -> None:  # fmt: skip
     """Invert a batch; assign those of its pixels that are inside and still unassigned."""
     polynomial, triangular = elements.polynomials[e], elements.triangular
     row, col, s, t, off, residual, where = batch
@@ -207,17 +190,9 @@ def _assign(
 
 @compiled(inline=True, relaxed=True)
 def _check(
-    elements: ElementTable,
-    pixels: Pixels,
-    e: int,
-    row: FloatArray,
-    col: FloatArray,
-    s: FloatArray,
-    t: FloatArray,
-    off: FloatArray,
-    residual: FloatArray,
-    count: int,
-) -> None:
+    elements: ElementTable, pixels: Pixels, e: int, row: FloatArray, col: FloatArray, s: FloatArray,
+    t: FloatArray, off: FloatArray, residual: FloatArray, count: int,
+) -> None:  # fmt: skip
     """Compute the residuals of the first ``count`` pixels, two ways: see Batch."""
     curved = not elements.triangular
     a = coefficients(elements.polynomials[e, 0])
@@ -238,15 +213,9 @@ def _check(
 
 @compiled(inline=True, relaxed=True)
 def _write(
-    fields: FloatArray,
-    values: FloatArray,
-    e: int,
-    triangular: bool,
-    where: IntArray,
-    s: FloatArray,
-    t: FloatArray,
-    count: int,
-) -> None:
+    fields: FloatArray, values: FloatArray, e: int, triangular: bool, where: IntArray,
+    s: FloatArray, t: FloatArray, count: int,
+) -> None:  # fmt: skip
     """Write the fields, or the local coordinates, at the first ``count`` pixels of a batch."""
     if fields.shape[1] == 0:
         for k in range(count):
@@ -260,14 +229,9 @@ def _write(
 
 @compiled(relaxed=True)
 def evaluate(
-    polynomials: FloatArray,
-    curved: bool,
-    element: NDArray[np.int32],
-    xi: FloatArray,
-    out: FloatArray,
-    thread: int,
-    threads: int,
-) -> None:
+    polynomials: FloatArray, curved: bool, element: NDArray[np.int32], xi: FloatArray,
+    out: FloatArray, thread: int, threads: int,
+) -> None:  # fmt: skip
     """Write a field's polynomials (m, c, 9) at located pixels to ``out`` (c, rows, cols).
 
     ``xi`` (rows, cols, 2) may lie in memory in any order.

@@ -103,7 +103,9 @@ def image(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None
 def correlate(case: CaseName, out: OutFolder, whole_field: WholeField = None) -> None:
     """Measure the images by micromorphic IDIC: DIR/correlation, and DIR/whole_field if asked to."""
     with _stages(case, out, whole_field=whole_field) as stages:
-        results, wholes = stages.correlate(), stages.measure()
+        stages.correlate()
+        wholes = stages.measure()
+        results = stages.correlate()  # some of them may come from what was measured
     for strain, result in results.items():
         print(f"{100 * strain:6.2f} %  {result.outcome.name.lower()}: {result.outcome.value}")
     for strain, whole in wholes.items():
@@ -229,6 +231,9 @@ def measure(
     mesh: Annotated[
         Path | None, typer.Option(help="Triangles, from the middle of the image, x right, y up.")
     ] = None,
+    brightness: Annotated[
+        int, typer.Option(help="Degree of polynomials by which gain and offset may vary: 0 to 6.")
+    ] = 0,
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
@@ -246,7 +251,7 @@ def measure(
     with bars() as progress:
         summary = measure_images(
             reference, deformed, out, mask=mask, pixel_size=pixel_size, mesh=mesh,
-            progress=progress,
+            brightness=brightness, progress=progress,
         )  # fmt: skip
     print_report(measure_report(summary), out)
 

@@ -134,8 +134,9 @@ class Run(StagedRun[Case]):
         images, correlated = self._correlated()
 
         def work() -> list[Path]:
-            results, experiment = self._results(images), self.case.experiment
-            return self._whole_fields.of_images(images, results, options, experiment, self.progress)
+            results = {e: Result.read(self._result_path(e)) for e in images.strains}
+            how = options, self.case.correlation, self.case.experiment
+            return self._whole_fields.of_images(images, results, *how, self.progress)
 
         self.do("measure", self._measure_key(correlated), work)
         return {strain: self._whole_fields.read(name_of(strain)) for strain in images.strains}
@@ -323,7 +324,12 @@ class Run(StagedRun[Case]):
         return self.folder / "correlation" / f"result_{round(1e4 * strain):04d}.json"
 
     def _results(self, images: ImageSet) -> dict[float, Result]:
-        return {strain: Result.read(self._result_path(strain)) for strain in images.strains}
+        """Of the images, correlated again where the whole displacement made that possible."""
+        paths, key = {e: self._result_path(e) for e in images.strains}, self._correlate_key(images)
+        if self.case.whole_field.measure and self.is_finished("measure", self._measure_key(key)):
+            again = {e: self._whole_fields.result_path(e) for e in images.strains}
+            paths |= {e: path for e, path in again.items() if path.exists()}
+        return {strain: Result.read(path) for strain, path in paths.items()}
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from modeharvest.fem.field import Mesh, read_mesh, read_plane_mesh, write_mesh
+from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.finite_element.files import (
     Given,
     read_result,
@@ -82,7 +83,8 @@ class MeasureCase:
     ``reference``, ``deformed``: files, the latter in the order of the test, wildcards allowed.
     ``mask``: an image, not black on material of the reference; None to find it by its speckle.
     ``pixel_size`` [mm]; None for lengths in px. ``mesh``: of the material, of T3 or T6 elements, a
-    file that meshio reads; None to make it from the mask.
+    file that meshio reads; None to make it from the mask. ``brightness``: degree of the polynomials
+    by which gain and offset of an image may vary, 0 to 6.
     """
 
     reference: Path
@@ -90,8 +92,10 @@ class MeasureCase:
     mask: Path | None = None
     pixel_size: float | None = None
     mesh: Path | None = None
+    brightness: int = 0
 
     def __post_init__(self) -> None:
+        Brightness(self.brightness, self.brightness)  # checks its degree
         if self.pixel_size is not None:
             require_within("expected a pixel size [mm]", self.pixel_size, 0.0, above=True)
         for path in (self.reference, *self.files.values(), self.mask, self.mesh):
@@ -137,7 +141,7 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _key(self) -> str:
         inputs = [self.case.reference, self.case.mask, self.case.mesh]
         files = [None if path is None else sha256_of(path) for path in inputs]
-        return stage_key([files, self.case.pixel_size], *CODE)
+        return stage_key([files, self.case.pixel_size, self.case.brightness], *CODE)
 
     @cached_property
     def material(self) -> MeshedMaterial:
@@ -229,8 +233,11 @@ class MeasureRun(StagedRun[MeasureCase]):
             names = str(self.case.reference), str(self.case.files[name])
             pair, body = self.pair(name), self._body
             known = 0.0 * body.mesh.nodes if before is None else before.displacement
-            start = block_motion(pair, body.mesh, known, names)
-            result = displacement_from(start, pair, body, progress=self.progress)
+            start = block_motion(pair, body, known, names)
+            light = self.case.brightness
+            result = displacement_from(
+                start, pair, body, light_degree=light, progress=self.progress
+            )
             write_result(tables[0], result, given)
             write_vtu(tables[1], result, given)
             write_csv(tables[2], result, given=given)
@@ -241,7 +248,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN off the material."""
-        return residual(self.pair(name), result.displacement_on())
+        return residual(self.pair(name), result.displacement_on(), self.case.brightness)
 
     def all(self) -> dict[str, Any]:
         """Do everything that is not finished; returns the content of ``summary.json``."""
@@ -266,6 +273,7 @@ class MeasureRun(StagedRun[MeasureCase]):
                 + [f"--mask {case.mask}"] * (case.mask is not None)
                 + [f"--pixel-size {case.pixel_size:g}" for _ in [0] if case.pixel_size]
                 + [f"--mesh {case.mesh}"] * (case.mesh is not None)
+                + [f"--brightness {case.brightness}"] * (case.brightness > 0)
                 + [f"--out {self.folder}"]
             ),
             "unit": case.unit,
@@ -284,7 +292,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         u = result.displacement_on()
         inside = u[mask & np.isfinite(u).all(axis=-1)] / px
         pair = self.pair(name)
-        gain, offset = brightness(pair, u)
+        gain, offset = (part.mean() for part in brightness(pair, u, self.case.brightness))
         f, material = pair.reference, pair.masks[0]
         noise = estimated_noise(f, material).sd * float(np.hypot(1.0, gain))
         return {
@@ -296,8 +304,8 @@ class MeasureRun(StagedRun[MeasureCase]):
             **picked(result, "cutoff_px unknowns effective_unknowns pixels"),
             "outside_px": result.outside,
             **picked(result, "residual_rms residual_noise library"),
-            "gain": gain,
-            "offset": offset,
+            "gain": float(gain),
+            "offset": float(offset),
             "seconds": self.timings.get(f"image {name}"),
             "image_noise": noise,
             "warnings": [*result.warnings, *misfit_of(result, noise, f[material])],
@@ -312,6 +320,7 @@ def measure(
     mask: Path | str | None = None,
     pixel_size: float | None = None,
     mesh: Path | str | None = None,
+    brightness: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
@@ -321,6 +330,6 @@ def measure(
     """
     case = MeasureCase(
         Path(reference), tuple(map(str, deformed)), None if mask is None else Path(mask),
-        pixel_size, None if mesh is None else Path(mesh),
+        pixel_size, None if mesh is None else Path(mesh), brightness,
     )  # fmt: skip
     return MeasureRun(case, Path(folder), progress).all()

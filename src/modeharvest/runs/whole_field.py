@@ -16,11 +16,18 @@ import numpy as np
 from numba import get_num_threads
 
 from modeharvest.fem.experiment import Experiment
+from modeharvest.idic.correlate import ASTRAY
 from modeharvest.idic.finite_element.files import Given, read_result, write_result, write_vtu
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
-from modeharvest.idic.finite_element.result import NodalResult, WholeField, refitted
+from modeharvest.idic.finite_element.result import (
+    NodalResult,
+    WholeField,
+    refitted,
+    refitted_correlation,
+)
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
+from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -118,6 +125,10 @@ class WholeFields:
         """The HDF5 file of an image; the VTU beside it has the same name."""
         return self.folder / f"{name}.h5"
 
+    def result_path(self, strain: float) -> Path:
+        """The JSON file of a correlation that took the place of one that had gone astray."""
+        return self.folder / f"{name_of(strain)}_result.json"
+
     def write(
         self, name: str, found: NodalResult, given: Given, seconds: float
     ) -> tuple[Path, Path]:
@@ -134,12 +145,14 @@ class WholeFields:
         images: ImageSet,
         results: Mapping[float, Result],
         options: VirtualWholeFieldOptions,
+        correlation: SquareLatticeOptions,
         experiment: Experiment,
         progress: Progress,
     ) -> list[Path]:
         """Measure every deformed image of a virtual experiment, from its correlation's result.
 
-        They are shared out among processes, as many as there are cores and memory for.
+        Where that had gone astray, it is correlated again from what was measured. Images are shared
+        out among processes, as many as there are cores and memory for.
         """
         how, mask = options.of(experiment, images.grid.pixel_size), images.mask()
         most = min(get_num_threads() if is_alone() else 1, len(images.strains))
@@ -150,7 +163,7 @@ class WholeFields:
             # The last state takes longest, and its progress is seen.
             first, *others = (
                 partial(
-                    _measure, self, images.folder, body, how, options.camera,
+                    _measure, self, images.folder, body, how, options.camera, correlation,
                     {strain: results[strain] for strain in images.strains[-1 - k :: -count]},
                 )
                 for k in range(count)
@@ -161,7 +174,8 @@ class WholeFields:
                     pickle.dump(share, to)
             first(progress)
         stems = [self.path(name_of(strain)) for strain in images.strains]
-        return [path.with_suffix(kind) for path in stems for kind in (".h5", ".vtu")]
+        again = [p for p in map(self.result_path, images.strains) if p.exists()]
+        return again + [path.with_suffix(kind) for path in stems for kind in (".h5", ".vtu")]
 
     def compared(
         self, comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
@@ -187,14 +201,9 @@ class WholeFields:
 
 
 def _measure(
-    files: WholeFields,
-    folder: Path,
-    body: Body,
-    how: FiniteElementOptions,
-    camera: bool,
-    results: Mapping[float, Result],
-    progress: Progress,
-) -> None:
+    files: WholeFields, folder: Path, body: Body, how: FiniteElementOptions, camera: bool,
+    correlation: SquareLatticeOptions, results: Mapping[float, Result], progress: Progress,
+) -> None:  # fmt: skip
     """Measure images in a folder one after another, from their correlations, by strain."""
     images, law = ImageSet.read(folder), None if how.law is None else how.law.material
 
@@ -207,6 +216,13 @@ def _measure(
         with with_remedy(of):
             pair = images.pair(strain, camera=camera)
             found = measure_displacement(pair, result, body, options=how, progress=report)
+        files.result_path(strain).unlink(missing_ok=True)
+        if result.outcome in ASTRAY:
+            pair, a = images.pair(strain, camera=correlation.camera), result.unknowns
+            where = result.ansatz, a, images.mask()
+            result, _ = refitted_correlation(found, pair, *where, correlation.options())
+            make_folder(files.folder)
+            result.write(files.result_path(strain))
         given, seconds = Given(material=law, correlation=result), time.perf_counter() - begin
         files.write(name_of(strain), found, given, seconds)
 

@@ -1,0 +1,190 @@
+"""'modeharvest measure' on images of all kinds, for which it has to find its start by itself.
+
+It gets what a user has: 8-bit images and the reference's mask, no lattice, no mode, no mask of the
+deformed images. Of each deformed image: the cut-off wavelength, error rms per component, below what
+the errors of 95 and of 99.9 % of the pixels are, the largest one, the share of the material that is
+measured, and the seconds it took; errors of the last image where there are several.
+
+Run: scripts/env python benchmarks/measure_alone.py [--only CASE ...] [--out out/measure_alone]
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from large_strain import SCENE
+from large_strain import truth as stretched
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Solution
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.finite_element.files import read_result
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.imaging.speckle.pattern import Speckle
+from modeharvest.runs.case import Case, shipped_solution
+from modeharvest.runs.measure import measure
+from modeharvest.validation.scoring.star import Star, exact_images, fine_speckle
+from modeharvest.validation.truth import rms
+
+Images = tuple[list[np.ndarray], np.ndarray, np.ndarray]
+"""Reference and deformed images [0 ... 1], mask, and the last one's u (rows, cols, 2), up [px]."""
+
+
+def specimen(
+    folder: Path,
+    case: str = "paper-virtual",
+    strain: float = 0.128,
+    size: float = 1.0,
+    light: float = 0.0,
+    **imaging: Any,
+) -> Images:
+    """A state of a shipped solution, with finer speckle, noise, or light that changes by a share.
+
+    ``light``: how much brighter the deformed image is at its right end, and darker at its left.
+    """
+    spec, solution = Case.read(case).imaging, shipped_solution(case)
+    speckle = replace(
+        spec.speckle, standard_deviation=spec.speckle.standard_deviation / size,
+        blur_px=max(0.8, spec.speckle.blur_px * size),
+    )  # fmt: skip
+    noise = imaging.pop("noise", None)
+    sensor = spec.sensor if noise is None else replace(spec.sensor, read_noise=noise)
+    imaging = {"pixel_size": 0.02, "distortion": None, "shape": None} | imaging
+    spec = replace(spec, speckle=speckle, sensor=sensor, background=0.06, **imaging)
+    assert solution
+    return imaged(Solution.read(solution), spec, folder, strain, light)
+
+
+def plate(folder: Path) -> Images:
+    """A plate of 20 x 16 mm with a hole of 6 mm, at 6 %."""
+    from modeharvest.fem.simulate import simulate
+
+    body = Specimen(1, 1, diameter=6.0, pitch=12.0, bulk_x=4.0, bulk_y=2.0)
+    solution = simulate(Experiment(body, strains=(0.06,), mesh_size=0.25))
+    spec = replace(Case.read("paper-virtual").imaging, pixel_size=0.02, background=0.06)
+    return imaged(solution, spec, folder, 0.06, 0.0)
+
+
+def imaged(solution: Solution, spec: Any, folder: Path, strain: float, light: float) -> Images:
+    """Images of a state, and its truth."""
+    images = make_images(solution, spec, folder / "set", [strain])
+    pair = images.pair(strain, camera=True)
+    slope = 1.0 + light * np.linspace(-1.0, 1.0, pair.grid.cols)
+    u = images.truth(strain).displacement / pair.grid.pixel_size
+    return [pair.reference, slope * pair.deformed], pair.masks[0], u
+
+
+def star(folder: Path, noise: float = 0.0) -> Images:
+    """The star images of resolution.md: waves of 10 to 300 px, half a pixel high."""
+    shape = Star()
+    f, g, _ = exact_images(shape, fine_speckle())
+    random = np.random.default_rng(0)
+    f, g = (image + noise * random.standard_normal(image.shape) for image in (f, g))
+    x, y = np.meshgrid(shape.grid.x, shape.grid.y)
+    return [f, g], np.ones(shape.grid.shape, bool), shape.displacement(x, y)
+
+
+def rigid(folder: Path, shift: tuple[float, float], turn_deg: float) -> Images:
+    """A plate that moves and turns as a whole, in front of a dark background."""
+    grid = PixelGrid.centred(500, 600, 1.0)
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    F, speckle = np.array([[c, -s], [s, c]]), Speckle(fine_speckle(), grid.shape)
+    points = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+    sides = np.array([220.0, 180.0])
+
+    def image(at: np.ndarray) -> np.ndarray:
+        shown = 0.2 + 0.6 * speckle(*grid.to_px(at[..., 0], at[..., 1]))
+        return np.where((abs(at) < sides).all(axis=-1), shown, 0.06)
+
+    u = points @ (F - np.eye(2)).T + np.array(shift)
+    return [image(points), image((points - np.array(shift)) @ F)], _inside(points, sides), u
+
+
+def _inside(points: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    return np.asarray((abs(points) < sides).all(axis=-1))
+
+
+def stretch(folder: Path, strains: Sequence[float]) -> Images:
+    """A sequence of 4 x 4 holes that is stretched, with pattern and w (large_strain.py)."""
+    images = [SCENE.image(None) / 255.0]
+    for n, strain in enumerate(strains):
+        images.append(SCENE.image(lambda p, e=strain: stretched(e, p), n + 1) / 255.0)
+    u = stretched(strains[-1], SCENE.points) / SCENE.grid.pixel_size
+    return images, SCENE.mask, u
+
+
+CASES: dict[str, Callable[[Path], Images]] = {
+    "paper's specimen, 12.8 %": specimen,
+    "7.8 %, before buckling": lambda folder: specimen(folder, strain=0.078),
+    "12.8 %, noise of 2 %": lambda folder: specimen(folder, noise=0.02),
+    "12.8 %, speckle of 6 px": lambda folder: specimen(folder, size=0.5),
+    "12.8 %, speckle of 4 px": lambda folder: specimen(folder, size=0.33),
+    "12.8 %, 0.01 mm/px, 4 px": lambda folder: specimen(folder, size=0.33, pixel_size=0.01),
+    "twin, 12.7 %, 0.02 mm/px": lambda folder: specimen(folder, "paper-real-twin", 0.127),
+    "twin, 12.7 %, 0.01 mm/px": lambda f: specimen(f, "paper-real-twin", 0.127, pixel_size=0.01),
+    "12.8 %, light ± 5 %": lambda folder: specimen(folder, light=0.05),
+    "12.8 %, light ± 5 %, --brightness 2": lambda folder: specimen(folder, light=0.05),
+    "plate with a hole": plate,
+    "star": star,
+    "star, noise of 2 %": lambda folder: star(folder, 0.02),
+    "shift by 40 px": lambda folder: rigid(folder, (31.3, 25.7), 0.0),
+    "turn by 10°": lambda folder: rigid(folder, (5.3, -8.6), 10.0),
+    "stretched by 30 % in one step": lambda folder: stretch(folder, [0.3]),
+    "stretched by 50 % in 5 steps": lambda folder: stretch(folder, [0.1, 0.2, 0.3, 0.4, 0.5]),
+    "stretched by 100 % in 10 steps": lambda f: stretch(f, [0.1 * k for k in range(1, 11)]),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--out", type=Path, default=Path("out/measure_alone"))
+    given = parser.parse_args()
+    print("| images | ℓ | rms | 95 % | 99.9 % | largest | measured | s |")
+    print("|---|---|---|---|---|---|---|---|", flush=True)
+    for name in given.only:
+        folder = given.out / "".join(c if c.isalnum() else "_" for c in name)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        try:
+            degree = int(name.rsplit(" ", 1)[1]) if "--brightness" in name else 0
+            print(f"| {name} | {row(CASES[name], folder, degree)} |", flush=True)
+        except Exception as error:  # the others are wanted, too
+            print(f"| {name} | {type(error).__name__}: {error} |", flush=True)
+
+
+def row(make: Callable[[Path], Images], folder: Path, brightness: int = 0) -> str:
+    """Measure a case, whose light may vary by polynomials of a degree; returns its numbers."""
+    images, mask, truth = make(folder)
+    files = [folder / f"image_{n:02d}.tif" for n in range(len(images))]
+    for file, image in zip(files, images, strict=True):
+        write_image(file, np.clip(np.rint(255.0 * image), 0, 255).astype(np.uint8))
+    write_image(folder / "mask.tif", mask)
+    summary = measure(
+        files[0], files[1:], folder / "out", mask=folder / "mask.tif", brightness=brightness
+    )
+    last = summary["images"][-1]
+    found = read_result(folder / f"out/results/{last['name']}.h5").displacement_on()
+    error = (found - truth)[mask & np.isfinite(truth).all(axis=-1)]
+    there = error[np.isfinite(error).all(axis=-1)]
+    length = np.linalg.norm(there, axis=1)
+    return " | ".join(
+        [f"{last['cutoff_px']:.0f}", f"{rms(there):.3f}"]
+        + [f"{np.quantile(length, q):.2f}" for q in (0.95, 0.999, 1.0)]
+        + [f"{100 * len(there) / len(error):.1f} %", f"{last['seconds']:.0f}"]
+    )
+
+
+if __name__ == "__main__":
+    main()
