@@ -64,6 +64,8 @@ _SHORT_PX = 0.1
 shorter; rms over the nodes [px]."""
 _LEAST_DET = 0.1
 """Elements that shrink to less are an iteration gone astray."""
+_UNLIKE = 0.25
+"""Mean square residual of an element, over the reference's variance, where images don't match."""
 _ROUNDS = 3
 _SETTLED = 0.5
 """Relative change of the cut-off wavelength that needs no other round."""
@@ -165,12 +167,17 @@ def measure_displacement(
 
 def coarse_displacement(
     pair: ImagePair, start: Start, on: Body, *, options: FiniteElementOptions
-) -> FloatArray:
-    """(n, 2) u [mm] before the last cut-off is sought; for the rest see `measure_displacement`."""
+) -> tuple[FloatArray, BoolArray]:
+    """(n, 2) u [mm] before the last cut-off is sought, and at which nodes (n,) the images match.
+
+    Elsewhere it has ended in a local minimum. For the rest see :func:`measure_displacement`.
+    """
     course = _Measurement(pair, start, on, options)
     for stage in (*_STAGES, _Stage(FULL, _FIRST_PX)):
         course.through(stage)
-    return course.u.reshape(-1, 2)
+    sums, grey = course.linearised().sums, course._prepare(FULL).pixels.grey
+    unlike = sums.squares > _UNLIKE * float(grey.var()) * sums.weights
+    return course.u.reshape(-1, 2), ~np.isin(np.arange(len(on.mesh.nodes)), on.mesh.cells[unlike])
 
 
 @dataclass(frozen=True, eq=False)

@@ -205,14 +205,9 @@ def refitted(measured: NodalResult, ansatz: Ansatz, guess: FloatArray, mask: Boo
 
 
 def refitted_correlation(
-    measured: NodalResult,
-    pair: ImagePair,
-    ansatz: Ansatz,
-    guess: FloatArray,
-    mask: BoolArray,
-    options: CorrelationOptions,
-    progress: Progress = silent,
-) -> tuple[Result, Result]:
+    measured: NodalResult, pair: ImagePair, ansatz: Ansatz, guess: FloatArray, mask: BoolArray,
+    options: CorrelationOptions, progress: Progress = silent,
+) -> tuple[Result, Result]:  # fmt: skip
     """Correlate from an ansatz :func:`refitted` to what was measured; the result, and the refit.
 
     Where the correlation ends astray the refit is the result, with the outcome REFITTED.

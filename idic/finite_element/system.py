@@ -252,13 +252,16 @@ class Body:
         self._factorised = M, R, weight
         return self._factor
 
-    def smoothed(self, u: FloatArray, cutoff: float) -> FloatArray:
-        """(n, 2) a displacement less its waves shorter than a cut-off wavelength [mm]."""
-        one, R = csr_array(diags_array(np.ones(u.size))), self.smoothness
-        weight = (cutoff / self.wavelength) ** Smoothness.power * self.energies(one)
+    def smoothed(self, u: FloatArray, cutoff: float, known: BoolArray | None = None) -> FloatArray:
+        """(n, 2) u less waves shorter than a cut-off [mm], from nodes (n,) where it is known."""
+        there = np.ones(u.size) if known is None else np.repeat(known, 2).astype(float)
+        one, R = csr_array(diags_array(there)), self.smoothness
         if not R.data.any():  # a single element
             return u
-        return self.factor(one, R, weight / self.energies(R)).solve(u.ravel()).reshape(-1, 2)
+        weight = (cutoff / self.wavelength) ** Smoothness.power * self.energies(one)
+        return (
+            self.factor(one, R, weight / self.energies(R)).solve(there * u.ravel()).reshape(-1, 2)
+        )
 
     def samples(self, blocks: FloatArray) -> FloatArray:
         """(2 n, SAMPLES) random vectors of the covariance M, given by its blocks."""

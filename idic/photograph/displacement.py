@@ -75,13 +75,9 @@ _SAMPLES, _LEAST = 100_000, 0.1
 
 
 def displacement_from(
-    start: FloatArray,
-    pair: ImagePair,
-    body: Body,
-    options: FiniteElementOptions = _LAST,
-    progress: Progress = silent,
-    light_degree: int = 0,
-) -> NodalResult:
+    start: FloatArray, pair: ImagePair, body: Body, options: FiniteElementOptions = _LAST,
+    progress: Progress = silent, light_degree: int = 0,
+) -> NodalResult:  # fmt: skip
     """Measure the displacement of a photograph on a mesh, from a start (n, 2) at its nodes [mm].
 
     ``pair``: the mask of the reference; brightness may differ. InputError if the images don't
@@ -97,8 +93,10 @@ def displacement_from(
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(alike, deformed_mask=mask)
 
-    for off_px in _OFF_PX if is_sought or light_degree else ():
-        u = coarse_displacement(seen(off_px), start, body, options=_FIRST)
+    for off_px in _OFF_PX if pair.deformed_mask is None else ():
+        u, known = coarse_displacement(seen(off_px), start, body, options=_FIRST)
+        if not known.all():  # they are tried again from where their neighbours are
+            start = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
     return measure_displacement(seen(_AT_EDGE_PX), start, body, options=options, progress=progress)
 
 

@@ -141,14 +141,9 @@ class WholeFields:
         return path, path.with_suffix(".vtu")
 
     def of_images(
-        self,
-        images: ImageSet,
-        results: Mapping[float, Result],
-        options: VirtualWholeFieldOptions,
-        correlation: SquareLatticeOptions,
-        experiment: Experiment,
-        progress: Progress,
-    ) -> list[Path]:
+        self, images: ImageSet, results: Mapping[float, Result], options: VirtualWholeFieldOptions,
+        correlation: SquareLatticeOptions, experiment: Experiment, progress: Progress,
+    ) -> list[Path]:  # fmt: skip
         """Measure every deformed image of a virtual experiment, from its correlation's result.
 
         Where that had gone astray, it is correlated again from what was measured. Images are shared
