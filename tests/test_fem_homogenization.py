@@ -24,7 +24,12 @@ from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize, ranked_branches
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
-from modeharvest.fem.lattice.micromorphic.mesh import quadrature, read_body_mesh, rectangle_mesh
+from modeharvest.fem.lattice.micromorphic.mesh import (
+    quadrature,
+    read_body_mesh,
+    rectangle_mesh,
+    specimen_mesh,
+)
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.path import HomogenizedPath
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern, snapped
@@ -397,6 +402,18 @@ def test_snapped_waves_repeat_on_the_cell() -> None:
     np.testing.assert_allclose(paper(points), PATTERN(points), atol=1e-12)
     with pytest.raises(InputError, match="larger cell"):
         snapped(PlaneWaves(0.7 * exact.vectors, exact.cosine, exact.sine), PITCH * np.eye(2))
+
+
+@pytest.mark.parametrize("stacking", ["square", "triangular"])
+def test_as_much_of_a_specimen_is_lattice_as_its_holes_cells_fill(stacking: str) -> None:
+    specimen = Specimen(8, 5, stacking=stacking)
+    mesh, is_lattice = specimen_mesh(specimen)
+    areas = quadrature(mesh, 2).weights.sum(axis=1)
+    cells = len(specimen.hole_centres) * abs(np.linalg.det(specimen.vectors))
+    assert areas[is_lattice].sum() == pytest.approx(cells)
+    assert areas.sum() == pytest.approx(4 * np.prod(specimen.half_size))
+    # Without edges there is nothing else.
+    assert specimen_mesh(Specimen(8, 5, bulk_x=0, bulk_y=0, stacking=stacking))[1].all()
 
 
 def test_modes_that_will_not_do_are_refused() -> None:
