@@ -2,7 +2,8 @@
 
 At every load the least stable wave is found: on a grid of the zone, from its best points on by
 descent along the eigenvalue's gradient, and for waves much longer than the cell by the acoustic
-tensor of the effective medium. The load at which the least value is zero is a root in one variable.
+tensor of the effective medium. Once it is unstable, its own critical load is found as a root, and
+all waves are looked at there again.
 
 Wave vectors are phases (k . a1, k . a2) [rad]; k, -k and k plus 2 pi are the same mode.
 """
@@ -143,7 +144,7 @@ class LatticeCritical:
     state: CellState
     """The equilibrium at ``load``."""
     history: tuple[LeastStable, ...]
-    """The least stable wave at every load looked at, by load."""
+    """The least stable wave at every load at which all were looked at, by load."""
     below: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
     """Number of negative eigenvalues at each of ``waves`` a millionth of the load below and above
