@@ -128,6 +128,9 @@ def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) 
     assert [p["refitted"] for p in mode["parameters"]] == pytest.approx(
         list(refit.mode_parameters())
     )
+    assert [p["deviation"] for p in mode["parameters"]] == pytest.approx(
+        list(refit.standard_errors()[refit.ansatz.phi_slice(0)])
+    )
     true = truth(STATES["frame_2"])(SCENE.points)
     best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
     apart = rms_px(refit.displacement() - best.displacement(), SCENE.mask)

@@ -54,7 +54,7 @@ def known(mesh: Mesh, u: np.ndarray, covariance: np.ndarray | None = None) -> No
     n, sd = len(mesh.nodes), np.full_like(u, 1e-3)
     C = np.zeros((n, 4, 4)) if covariance is None else np.broadcast_to(covariance, (n, 4, 4))
     return NodalResult(
-        mesh, u, np.zeros_like(u), sd, sd, C, GRID, 20.0, (), 0.01, 0.01, 1, 0, 1.0, 0.0, ""
+        mesh, u, np.zeros_like(u), sd, sd, C, GRID, 20.0, (), 0.01, 0.01, 1, 0, 1.0, ""
     )
 
 

@@ -58,7 +58,8 @@ class ModeBothWays:
     correlated_v_max_mm: float
     """Largest |v| over the mode's own part [mm]."""
     parameters: tuple[dict[str, Any], ...]
-    """Of each its ``name``, ``unit``, ``refitted`` and ``correlated`` value."""
+    """Of each its ``name``, ``unit``, ``refitted`` value with its ``deviation`` (None if it isn't
+    determined), and ``correlated`` value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,9 +109,11 @@ def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> Who
 
 def _both_ways(refit: Result, correlated: Result, i: int) -> ModeBothWays:
     mode = refit.ansatz.modes[i]
-    each = zip(mode.family.names, mode.family.units, refit.mode_parameters(i),
+    sd = refit.standard_errors()[refit.ansatz.phi_slice(i)]
+    deviation: list[float | None] = [float(v) if np.isfinite(v) else None for v in sd]
+    each = zip(mode.family.names, mode.family.units, refit.mode_parameters(i), deviation,
                correlated.mode_parameters(i), strict=True)  # fmt: skip
-    keys = ("name", "unit", "refitted", "correlated")
+    keys = ("name", "unit", "refitted", "deviation", "correlated")
     return ModeBothWays(
         v_max_mm=float(np.abs(_amplitude(refit, i)).max()),
         correlated_v_max_mm=float(np.abs(_amplitude(correlated, i)).max()),

@@ -111,8 +111,10 @@ class Deviations(NamedTuple):
 
     samples: FloatArray
     """(n, 2, s) what random noise makes of u [mm]."""
+    changes: FloatArray
+    """(n, 2, k) what smoothing, or no law, may change u by [mm]."""
     bias: FloatArray
-    """(n, 2) of u [mm]."""
+    """(n, 2) of u by that, and by the elements' own error [mm]."""
     gradient: FloatArray
     """(n, 4, 4) covariance by both of xx, xy, yx, yy of grad u [-]."""
 
@@ -121,12 +123,18 @@ class Deviations(NamedTuple):
         """(n, 2) of u [mm]."""
         return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
 
+    @property
+    def roots(self) -> FloatArray:
+        """(n, 2, s + k) vectors whose outer products sum up to the covariance of all nodes [mm]."""
+        return np.concatenate([self.samples / np.sqrt(SAMPLES), self.changes], axis=2)
+
     def with_bias(self, mesh: Mesh, change: FloatArray, of_slopes: float = 1.0) -> Deviations:
         """Count a possible change (n, 2) of u [mm], rms around nodes; its slope so many times."""
         slope = of_slopes * nodal_gradient(mesh, change)
         spread = smoothed(mesh, np.einsum("nij,nkl->nijkl", slope, slope))
         return Deviations(
             self.samples,
+            np.concatenate([self.changes, change[..., None]], axis=2),
             np.sqrt(self.bias**2 + smoothed(mesh, change**2)),
             self.gradient + spread.reshape(-1, 4, 4),
         )
@@ -164,7 +172,7 @@ def deviations(
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
     error = interpolation_error(mesh, at.u.reshape(-1, 2))
-    return Deviations(found, error, spread).with_bias(mesh, change, _OF_SLOPES)
+    return Deviations(found, found[..., :0], error, spread).with_bias(mesh, change, _OF_SLOPES)
 
 
 def contradicted(

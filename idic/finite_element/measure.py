@@ -35,7 +35,7 @@ from modeharvest.idic.finite_element.pixels import (
     images_on,
     normal_equations,
 )
-from modeharvest.idic.finite_element.result import NodalResult, Step
+from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body, Imbalance, Linearised, Smoothness
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
@@ -187,8 +187,6 @@ class _LevelOnMesh:
     level: Level
     images: LevelPair
     pixels: ElementPixels
-    blur: float = 0.0
-    """Of the reference whose gradient weighs the residual [px]."""
     slope_noise: float = 0.0
     """Variance of that gradient by noise [grey levels^2/mm^2]."""
     continued: ContinuedPixels = NONE_CONTINUED
@@ -216,7 +214,6 @@ class _Measurement:
         self.pair, self.body, self.start, self.options = pair, body, begin, options
         self.prior: Smoothness | Imbalance = Smoothness(body, begin)
         self.u = begin.ravel().copy()
-        self.history: list[Step] = []
         self.level: _LevelOnMesh | None = None
         self.kept: Linearised | None = None
         self.free: tuple[FloatArray, Deviations] | None = None
@@ -252,7 +249,7 @@ class _Measurement:
             _, d_row, d_col = spline.sample(on.pixels.row, on.pixels.col)
         slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
         return replace(
-            on, pixels=on.pixels._replace(slope=slope), blur=blur,
+            on, pixels=on.pixels._replace(slope=slope),
             slope_noise=noise * slope_noise(self.order, blur) / px**2,
             continued=continued_pixels(self.pair, noise, noise_g),
         )  # fmt: skip
@@ -287,15 +284,13 @@ class _Measurement:
         """Take steps until they are short."""
         self._prepare(stage.level)
         px, last = self.pair.grid.pixel_size, np.inf
-        for number in range(1, self.options.steps + 1):
+        for _ in range(self.options.steps):
             at = self.linearised()
             step = at.step(stage.cutoff_px * px)
             length = np.linalg.norm(step.reshape(-1, 2), axis=1) / px
             share = np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
             rms = float(np.sqrt(np.mean(length**2)))
-            longest, residual = float(length.max()), at.sums.rms
-            self.history.append(Step(stage.level, stage.cutoff_px, number, residual, rms, longest))
             if isinstance(self.prior, Imbalance) or rms > min(_SHORT_PX, 0.5 * last):
                 self.kept = None
             last = rms
@@ -394,13 +389,12 @@ class _Measurement:
             standard_deviation=np.hypot(sd.by_noise, sd.bias),
             noise_deviation=sd.by_noise,
             gradient_covariance=sd.gradient,
+            roots=sd.roots,
             grid=self.pair.grid,
             residual_rms=at.sums.rms,
             residual_noise=here.noise,
             effective_unknowns=here.unknowns,
-            blur_px=on.blur,
             library=self.body.library,
-            history=tuple(self.history),
             **picked(self, "start cutoff_px tried warnings contradicted"),
             **picked(at.sums, "pixels outside"),
         )

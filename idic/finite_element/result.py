@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,9 +17,8 @@ from modeharvest.idic.correlate import ASTRAY, correlate, fit_displacement, refi
 from modeharvest.idic.finite_element.cutoff import Risk
 from modeharvest.idic.finite_element.fields import deviation_of, field_of, nodal_gradient
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.result import Result
+from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
 from modeharvest.imaging.pair import ImagePair
@@ -34,21 +33,6 @@ _CHUNK = 500_000
 WHOLE = "the whole displacement"
 Where = PixelGrid | FloatArray | None
 """Pixels, points (k, 2) [mm], or the nodes."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """One Gauss-Newton step."""
-
-    level: Level
-    cutoff_px: float
-    number: int
-    """Of the images, cut-off wavelength [px], number of the step in its stage."""
-    residual: float
-    """Rms before the step [grey levels of the level]."""
-    step_px: float
-    longest_px: float
-    """Rms over the nodes, and the longest of a node [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +62,15 @@ class NodalResult:
     pixels mapped to where the deformed image isn't valid."""
     effective_unknowns: float
     """What the images determine of them [-]."""
-    blur_px: float
-    """Blur of the reference whose gradient weighs the residual [px]."""
     library: str
     """That factorised the matrices."""
-    history: tuple[Step, ...] = ()
-    """Every step."""
     warnings: tuple[str, ...] = ()
     """Sentences."""
     contradicted: float | None = None
     """Share of the free edges' nodes where a law changes u significantly; None without a law [-].
     """
+    roots: FloatArray | None = None
+    """(n, 2, k) whose outer products sum up to the covariance of all nodes [mm]; in no file."""
 
     @property
     def unknowns(self) -> int:
@@ -199,9 +181,25 @@ class WholeField:
 
 
 def refitted(measured: NodalResult, ansatz: Ansatz, guess: FloatArray, mask: BoolArray) -> Result:
-    """An ansatz, fitted to what was measured on the pixels of a mask; ``guess``: (n,) unknowns."""
-    u = measured.displacement_on()
-    return fit_displacement(u, measured.grid, ansatz, guess, mask & np.isfinite(u[..., 0]))
+    """An ansatz, fitted to what was measured on the pixels of a mask; ``guess``: (n,) unknowns.
+
+    Its covariance is that of what was measured, by noise and smoothing, unless it is from a file.
+    """
+    u, roots, mesh = measured.displacement_on(), measured.roots, measured.mesh
+    fit = fit_displacement(u, measured.grid, ansatz, guess, mask & np.isfinite(u[..., 0]))
+    if roots is None:
+        return fit
+    # Three points of an element, the middles of its sides, integrate quadratics exactly.
+    x, middle = mesh.nodes[mesh.cells], mesh.cells[:, 3:]
+    area = np.linalg.det(x[:, 1:3] - x[:, :1]) / 6.0 / measured.grid.pixel_size**2
+    weight = np.bincount(middle.ravel(), np.repeat(area, 3), len(mesh.nodes))
+    at = np.flatnonzero(weight)
+    J = fit.ansatz.sensitivities(fit.unknowns, *mesh.nodes[at].T[:, :, None])[:, 0]
+    known, lost = determined_part(fit.inverse)
+    moved = known @ np.einsum("kcn,k,kcs->ns", J, weight[at], roots[at], optimize=True)
+    inverse = moved @ moved.T / max(2.0 * fit.noise_sd**2, 1e-300)  # of which it is a factor
+    inverse[lost, lost] = np.inf
+    return replace(fit, inverse=inverse)
 
 
 def refitted_correlation(

@@ -202,7 +202,9 @@ class TwinRun(StagedRun[Case]):
             # Not the images' own masks: those are as the lens shows them.
             inside = np.asarray(np.isfinite(true).all(axis=-1))
             result, whole = results[name].result, results[name].whole
-            best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
+            # The ansatz doesn't describe w, so that other pixels have another best fit.
+            used = inside & harvesting.geometry.mask
+            best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, used)
             rows += _frame_rows(name, result, best, true, inside)
             errors = None
             if whole:

@@ -116,7 +116,7 @@ def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
     labels, numbers = zip(*found, strict=True)
     heads = headings(WholeFieldNumbers, WholeFieldSummary)
     table = ReportTable.of_states("whole", found, heads)
-    both = ("refitted to the whole displacement", "by IDIC")
+    both = ("refitted to the whole displacement", "±", "by IDIC")
     columns = ("", "", *(f"{label}: {way}" for label in labels for way in both))
     modes = ReportTable("Modes by both ways", columns, list(_mode_rows(numbers)), "whole-modes")
     return [*Card.tabular(table, wide=True), *Card.tabular(modes, wide=True)]
@@ -128,11 +128,13 @@ def _mode_rows(numbers: Sequence[Numbers]) -> Iterable[tuple[Cell, ...]]:
         modes: list[Numbers] = [
             n["modes"][i] if i < len(n["modes"]) else {"parameters": ()} for n in numbers
         ]
-        largest = [mode.get(key) for mode in modes for key in ("v_max_mm", "correlated_v_max_mm")]
+        largest = [
+            mode.get(key) for mode in modes for key in ("v_max_mm", "", "correlated_v_max_mm")
+        ]
         yield (f"largest |v{i + 1}|", "mm", *largest)
         found = [{p["name"]: p for p in mode["parameters"]} for mode in modes]
         units = {name: p["unit"] for column in found for name, p in column.items()}
         for name, unit in units.items():
             ways = (column.get(name, {}) for column in found)
-            values = [p.get(key) for p in ways for key in ("refitted", "correlated")]
+            values = [p.get(key) for p in ways for key in ("refitted", "deviation", "correlated")]
             yield (f"{name} of φ{i + 1}", unit, *values)
