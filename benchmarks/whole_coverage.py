@@ -6,20 +6,23 @@ material, and within 10 px of its edges: the share of components of u and of the
 strain in their intervals, mean and standard deviation over the seeds, the least of any seed; and
 the rms error over the rms standard deviation. Every measurement starts at the best fit of the
 ansatz. The truth's strain is that of its finite elements, a fifth as long as those of the
-measurement, averaged around their nodes.
+measurement, averaged around their nodes. Seeds are shared out among processes, and kept: goes on
+where it was stopped, or with more seeds.
 
 Run: scripts/env python benchmarks/whole_coverage.py [--seeds 30] [--noise 0 0.01 0.02]
-     [--json FILE]
+     [--workers 2] [--folder out/whole_coverage]
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import os
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from cutoff import SPECIMENS
@@ -41,9 +44,12 @@ from modeharvest.imaging.mapping.isoparametric import interpolate, locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.validation.campaign import Campaign, grid
+from modeharvest.validation.workers import Workers
 
 FloatArray = NDArray[np.float64]
 
+FUNCTION = "whole_coverage:one_seed"
 NAME, PIXEL = "square, d/l 0.79", 0.02
 STRAINS = "xx", "yy", "xy"
 NORMAL_95 = 1.959964
@@ -67,24 +73,36 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 0.01, 0.02])
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--folder", type=Path, default=Path("out/whole_coverage"))
     given = parser.parse_args()
+    here = str(Path(__file__).parent)  # where workers find FUNCTION
+    os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
+    given.folder.mkdir(parents=True, exist_ok=True)
     specimen, strain = SPECIMENS[NAME]
-    solution = simulate(Experiment(specimen, strains=(strain,), mesh_size=0.1))
-    rows: list[Row] = []
-    for seed in range(given.seeds):
-        with tempfile.TemporaryDirectory() as folder:
-            spec = ImagingSpec(pixel_size=PIXEL, speckle=SpeckleSpec(seed=seed))
-            make_images(solution, spec, folder)
-            images = ImageSet.read(Path(folder))
-            true = true_strain(solution, images.grid)
-            for noise in given.noise:
-                pair = noisy(images, strain, noise, seed)
-                rows.append(measured(pair, specimen, true, noise, seed))
-                show(rows[-1])
-        if given.json:
-            given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), "utf-8")
-    table(rows)
+    path = given.folder / "solution.h5"
+    if not path.exists():
+        simulate(Experiment(specimen, strains=(strain,), mesh_size=0.1)).write(path)
+    cases = grid({"noise": list(given.noise), "seed": 0}, seed=range(given.seeds))
+    campaign = Campaign(FUNCTION, cases, given.folder.resolve())
+    done = campaign.run(Workers(given.workers), lambda d, n, what: print(f"{d}/{n}", end="\r"))
+    print(f"{len(done)} seeds, {int((done['error'] != '').sum())} failed")
+    table([Row(**row) for rows in done["rows"].dropna() for row in rows])
+
+
+def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Rows of one seed at every noise, from the solution in the folder."""
+    (specimen, strain), seed = SPECIMENS[NAME], case["seed"]
+    solution = Solution.read(folder / "solution.h5")
+    rows = []
+    with tempfile.TemporaryDirectory() as own:
+        make_images(solution, ImagingSpec(pixel_size=PIXEL, speckle=SpeckleSpec(seed=seed)), own)
+        images = ImageSet.read(Path(own))
+        true = true_strain(solution, images.grid)
+        for noise in case["noise"]:
+            pair = noisy(images, strain, noise, seed)
+            rows.append(asdict(measured(pair, specimen, true, noise, seed)))
+    return {"rows": rows}
 
 
 def true_strain(solution: Solution, grid: PixelGrid) -> FloatArray:
@@ -121,17 +139,6 @@ def measured(pair: ImagePair, specimen: Specimen, true: FloatArray, noise: float
     each = {name: [*zip(*map(partial(of, name), both), strict=True)] for name in errors}
     parts = ({name: values[k] for name, values in each.items()} for k in range(3))
     return Row(noise, seed, found.cutoff_px, *parts)  # type: ignore[arg-type]
-
-
-def show(row: Row) -> None:
-    """Print a line."""
-    each = "  ".join(
-        f"{name}: {row.held[name][0]:.3f} {row.held[name][1]:.3f} "
-        f"({row.error[name][0] / row.deviation[name][0]:.2f} "
-        f"{row.error[name][1] / row.deviation[name][1]:.2f})"
-        for name in row.held
-    )
-    print(f"{row.noise:5.3f} {row.seed:3d} {row.cutoff_px:5.1f} px  {each}", flush=True)
 
 
 def table(rows: list[Row]) -> None:
