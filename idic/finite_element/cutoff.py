@@ -126,7 +126,7 @@ class Deviations(NamedTuple):
     @property
     def roots(self) -> FloatArray:
         """(n, 2, s + k) vectors whose outer products sum up to the covariance of all nodes [mm]."""
-        return np.concatenate([self.samples / np.sqrt(SAMPLES), self.changes], axis=2)
+        return np.concatenate([self.samples / np.sqrt(self.samples.shape[2]), self.changes], axis=2)
 
     def with_bias(self, mesh: Mesh, change: FloatArray, of_slopes: float = 1.0) -> Deviations:
         """Count a possible change (n, 2) of u [mm], rms around nodes; its slope so many times."""
