@@ -28,6 +28,8 @@ from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 
+_BAND = 256  # rows
+
 
 def lengths(field: FloatArray) -> FloatArray:
     """(...) Euclidean lengths of the vectors of a field (..., 2)."""
@@ -92,23 +94,33 @@ class Comparison:
     @property
     def w(self) -> FloatArray:
         """(rows, cols, 2) microfluctuation field, truth - IDIC [mm]."""
-        return _difference(self.displacement, self.result.displacement())
+        return self._error(self.result)
 
     @property
     def best_error(self) -> FloatArray:
         """(rows, cols, 2) truth - best fit [mm]: the model (ansatz) error."""
-        return _difference(self.displacement, self.best.displacement())
+        return self._error(self.best)
 
     @property
     def idic_to_best(self) -> FloatArray:
         """(rows, cols, 2) IDIC - best fit [mm]: the measurement error; NaN off the mask."""
-        return _difference(self.best_error, self.w)
+        w = self.w
+        return np.subtract(self.best_error, w, out=w)
+
+    def _error(self, fit: Result) -> FloatArray:
+        """(rows, cols, 2) truth - fit [mm]; in bands: at all pixels a fit takes four times that."""
+        error = np.empty_like(self.displacement)
+        for top in range(0, self.grid.rows, _BAND):
+            rows = slice(top, top + _BAND)
+            found = fit.ansatz.displacement(fit.unknowns, self.grid.x, self.grid.y[rows])
+            np.subtract(self.displacement[rows], found, out=error[rows])
+        return error
 
     def statistics(self) -> dict[str, VectorStatistics]:
         """Of the error ``w`` and of its parts ``best_fit`` and ``idic_to_best_fit`` [px]."""
-        parts = {"w": self.w, "best_fit": self.best_error, "idic_to_best_fit": self.idic_to_best}
-        px = self.grid.pixel_size
-        return {name: VectorStatistics.of(part, self.mask, px) for name, part in parts.items()}
+        parts = {"w": "w", "best_fit": "best_error", "idic_to_best_fit": "idic_to_best"}
+        mask, px = self.mask, self.grid.pixel_size
+        return {n: VectorStatistics.of(getattr(self, part), mask, px) for n, part in parts.items()}
 
     def error_parts(self) -> dict[str, float]:
         """Rms per component of truth - IDIC, truth - best fit and IDIC - best fit [px]."""
@@ -126,11 +138,6 @@ class Comparison:
         inside = self.cellular(specimen)
         v, at_best = (fit.v(0)[inside] for fit in (self.result, self.best))
         return 100.0 * float(np.sqrt(np.mean((v - at_best) ** 2)) / np.abs(at_best).max())
-
-
-def _difference(minuend: FloatArray, subtrahend: FloatArray) -> FloatArray:
-    """Subtract in place: such arrays are large, and new ones cost more than the difference."""
-    return np.subtract(minuend, subtrahend, out=subtrahend)
 
 
 def compare(

@@ -219,8 +219,9 @@ class Run(StagedRun[Case]):
         is_whole = case.whole_field.measure
         measured = MeasuredExperiment(case.experiment, case.correlation, solution, images, results)
         strains = sorted(results)
-        # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's.
-        with _brief_turns(), ThreadPoolExecutor(os.cpu_count()) as threads:
+        # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's and
+        # has a core: more states at once than the others only take memory.
+        with _brief_turns(), ThreadPoolExecutor(max(1, (os.cpu_count() or 2) - 1)) as threads:
 
             def of_each(work: Callable[..., T], *earlier: Sequence[Any]) -> Sequence[T]:
                 states = range(len(strains))
