@@ -1,9 +1,9 @@
 """What measured modes are worth: how good a test has to be for a homogenized force right to 1 %.
 
-For every d/l a 6 x 10 specimen is compressed until its pattern is as strong as the paper's at
-12.8 %, photographed as there without noise and with it, and the mode is measured in the images.
-Homogenization with that mode (a quarter, 24 RVEs) predicts the critical strain, the force at that
-strain and the rms of v1. Three tables, as Markdown:
+For every d/l a 6 x 10 specimen is compressed until its pattern is three quarters as strong as the
+paper's at 12.8 %, photographed as there without noise and with it, and the mode is measured in the
+images. Homogenization with that mode (a quarter, 24 RVEs) predicts the critical strain, the force
+at that strain and the rms of v1. Three tables, as Markdown:
 
 - what it predicts with the noise-free mode, beside the direct simulation;
 - parameter by parameter what an error of 1 % (of l for phases) makes of the prediction if the mode
@@ -57,8 +57,8 @@ from modeharvest.validation.homogenization import LatticeMode
 from modeharvest.validation.studies.modes_specimen import PatternCells, buckle
 
 FloatArray = NDArray[np.float64]
-PAPER = 0.128
-"""Nominal strain at which the paper's specimen has the amplitude that all specimens get [-]."""
+PAPER, SHARE = 0.128, 0.75
+"""Nominal strain of the paper's specimen [-], and the share of its amplitude there that all get."""
 PITCH, LARGEST = 1.9, 0.35
 """[mm]; nominal strain up to which a critical point is looked for [-]."""
 
@@ -113,7 +113,7 @@ class Test:
         if not path.exists():
             paper = Run(Case.read("paper-virtual"), self.folder / "paper").fem()
             u = paper.at(PAPER).displacement
-            wanted = PatternCells(paper.mesh, paper.specimen).amplitude(u)
+            wanted = SHARE * PatternCells(paper.mesh, paper.specimen).amplitude(u)
             buckle(Experiment(self.specimen, mesh_size=self.size), wanted, LARGEST).write(path)
         return Solution.read(path)
 
@@ -167,11 +167,13 @@ class Test:
             self.specimen, rve, PlateLoading(quarter=True), divisions=(4, 6)
         )
         found = homogenize(body, [self.strain])
-        if found.critical is None or not found.states:
-            return Prediction(np.nan, np.nan, np.nan)
+        critical = found.critical.load if found.critical else np.nan
+        if not found.states:
+            print(f"(not at {self.strain:.2%}: {found.outcome})")
+            return Prediction(critical, np.nan, np.nan)
         state = found.states[0]
         v = float(np.sqrt(np.mean(state.strains[:, 4] ** 2)))
-        return Prediction(found.critical.load, state.force, v)
+        return Prediction(critical, state.force, v)
 
 
 def report(test: Test, noises: list[float], seeds: int) -> None:
