@@ -12,8 +12,8 @@ at that strain and the rms of v1. Three tables, as Markdown:
   number shifts the pattern the more the farther it is from there: what is said is what it does at
   the ends of the cellular part along x or y;
 - for each noise the rms error of the parameters over the seeds (from the noise-free measurement),
-  the mean of their standard deviations by noise and by model error, and the errors of the
-  prediction that are left once the mode is snapped to the lattice.
+  the mean of their standard deviations by noise and by model error, of each kind those of the
+  worst parameter, and the errors of the prediction that are left once the mode is snapped.
 
 Run: scripts/env python benchmarks/measured_modes.py [--ratios 0.7 ...] [--noise 0.005 ...]
      [--seeds 3] [--out FOLDER]
@@ -61,6 +61,10 @@ PAPER, SHARE = 0.128, 0.75
 """Nominal strain of the paper's specimen [-], and the share of its amplitude there that all get."""
 PITCH, LARGEST = 1.9, 0.35
 """[mm]; nominal strain up to which a critical point is looked for [-]."""
+
+
+KINDS = ("amplitude", "wave number", "phase")
+"""Of a mode's parameters: [-], [pi/l], [mm]."""
 
 
 def row(*cells: object) -> None:
@@ -198,11 +202,9 @@ def report(test: Test, noises: list[float], seeds: int) -> None:
         enough = size * (0.01 / abs(changes[1])) ** (1.0 / power)
         row(name, kind, f"{p[k]:.5f} {unit}", f"{size:g} {unit}", *(f"{c:+.3%}" for c in changes),
             f"{enough:.4f} {unit}")  # fmt: skip
-    head("noise", *(f"{n} [{u}]: rms error, by noise, by model error"
-                    for n, u in zip(family.names, family.units, strict=True)),
+    head("noise", *(f"{kind}: rms error, by noise, by model error" for kind in KINDS),
          "critical strain", "force")  # fmt: skip
-    row("none", *(f"-, {a:.1e}, {b:.1e}" for a, b in zip(noise_model, model_error, strict=True)),
-        "", "")  # fmt: skip
+    row("none", *(f"–, {text}" for text in grouped(mode, noise_model, model_error)), "", "")
     for noise in noises:
         found = [test.measured(noise, seed) for seed in range(seeds)]
         errors = np.array([result.mode_parameters() - p for result, _, _ in found])
@@ -210,8 +212,13 @@ def report(test: Test, noises: list[float], seeds: int) -> None:
         bars = [np.mean([f[i] for f in found], axis=0) for i in (1, 2)]
         changes = [test.predicted(test.pattern(mode, p + e)).against(base) for e in errors]
         left = np.sqrt(np.mean(np.square(changes), axis=0))
-        texts = (f"{a:.1e}, {b:.1e}, {c:.1e}" for a, b, c in zip(rms, *bars, strict=True))
-        row(f"{noise:.1%}", *texts, f"{left[0]:.4%}", f"{left[1]:.4%}")
+        row(f"{noise:.1%}", *grouped(mode, rms, *bars), f"{left[0]:.4%}", f"{left[1]:.4%}")
+
+
+def grouped(mode: FourierMode, *values: FloatArray) -> list[str]:
+    """Of each kind of parameter the largest of some values (m,)."""
+    of = kinds(mode)
+    return [", ".join(f"{v[of == kind].max():.1e}" for v in values) for kind in KINDS]
 
 
 def effect(test: Test, mode: FourierMode, p: FloatArray, k: int, base: Prediction) -> FloatArray:
@@ -233,7 +240,7 @@ def effect(test: Test, mode: FourierMode, p: FloatArray, k: int, base: Predictio
 
 def kinds(mode: FourierMode) -> NDArray[np.str_]:
     """(m,) what the parameters are: of A, B, kx, ky, c of a wave."""
-    names = ("amplitude", "amplitude", "wave number", "wave number", "phase")
+    names = (KINDS[0], KINDS[0], KINDS[1], KINDS[1], KINDS[2])
     columns = (np.flatnonzero(column)[0] % 5 for column in mode.family.matrix.T)
     return np.array([names[c] for c in columns])
 

@@ -29,6 +29,7 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import quadratic
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
+from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.runs import run, whole_field
 from modeharvest.runs.case import Case
@@ -198,7 +199,8 @@ def share(tmp_path: Path) -> Share:
     corners = Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], [[0, 1, 2], [1, 3, 2]], "T3")
     body, options = Body(quadratic(corners)), FiniteElementOptions()
     files = whole_field.WholeFields(tmp_path)
-    return partial(whole_field._measure, files, tmp_path / "none", body, options, True, {})
+    how = True, SquareLatticeOptions()
+    return partial(whole_field._measure, files, tmp_path / "none", body, options, *how, {})
 
 
 def hand(share: Share, child: subprocess.Popen[bytes]) -> None:
