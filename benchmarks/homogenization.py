@@ -254,29 +254,24 @@ def strips() -> None:
 
 def draw_size_effect(found: dict[str, FloatArray], path: Path) -> None:
     """Draw critical strains and stresses over the number of cells."""
-    made, n = figure(7.4, 3.3), list(REFERENCE)
-    panels, (low, high) = made.subplots(1, 2), (found["direct"].min(1), found["direct"].max(1))
-    looks = dict(zip([*MODES, "first order"], ((BLUE, "o-"), (GREEN, "s-"), (RED, "^--"),
-                                               (GOLD, ":")), strict=True))  # fmt: skip
-    for axes, columns, scale in zip(panels, ((0,), (1, 2)), (100, 1000), strict=True):
-        for column in columns:
-            middle = scale * found["direct"].mean(axis=1)[:, column]
-            span = scale * np.stack([low[:, column], high[:, column]]) - middle
-            axes.errorbar(n, middle, np.abs(span), color="black", marker="D", ms=4, lw=1.2,
-                          capsize=2.5, label="direct, mean and both positions")  # fmt: skip
-            for kind, (colour, line) in looks.items():
-                axes.plot(n, scale * found[kind][:, column], line, color=colour, ms=3.5, lw=1.2,
-                          label=f"micromorphic, {kind}" if kind in MODES else kind)  # fmt: skip
-            if column:
-                text, place = f"at {STRESSES[column - 1]:.0%}", (n[0] + 0.4, middle[0])
-                axes.annotate(text, place, color="black", fontsize=7.5)
-        axes.set(xlabel="cells between the plates", xticks=n)
+    made, n = figure(9.0, 3.2), list(REFERENCE)
+    labels = ["critical strain [%]", *(f"nominal stress at {e:.0%} [kPa]" for e in STRESSES)]
+    looks = (BLUE, "o-"), (GREEN, "s-"), (RED, "^--"), (GOLD, ":")
+    for k, (axes, label) in enumerate(zip(made.subplots(1, 3), labels, strict=True)):
+        scale = 1000 if k else 100
+        both = scale * found["direct"][:, :, k].T
+        axes.errorbar(
+            n, both.mean(axis=0), 0.5 * np.ptp(both, axis=0), color="black", marker="D", ms=4,
+            lw=1.2, capsize=2.5, label="direct: mean and both positions",
+        )  # fmt: skip
+        for kind, (colour, line) in zip([*MODES, "first order"], looks, strict=True):
+            name = f"micromorphic, {kind}" if kind in MODES else kind
+            axes.plot(n, scale * found[kind][:, k], line, color=colour, ms=3.5, lw=1.2, label=name)
+        axes.set(xlabel="cells between the plates", ylabel=label, xticks=n)
         axes.grid(alpha=0.25)
-    panels[0].set_ylabel("critical strain [%]")
-    panels[1].set_ylabel("nominal stress [kPa]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    made.legend(handles, labels, frameon=False, loc="upper center", ncols=3, fontsize=7.5)
-    made.tight_layout(rect=(0, 0, 1, 0.86))
+    handles = made.axes[0].get_legend_handles_labels()
+    made.legend(*handles, frameon=False, loc="upper center", ncols=5, fontsize=7.5)
+    made.tight_layout(rect=(0, 0, 1, 0.92))
     made.patch.set_facecolor("white")
     with atomic(path) as temporary:
         made.savefig(temporary, format="png", dpi=150, facecolor="white")
