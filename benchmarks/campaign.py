@@ -2,7 +2,7 @@
 
 Three questions, each answered by whole campaigns, their workers' start included and apart:
 
-* speedup: correlations of the paper's images at a reduced resolution from perturbed starts, by
+* speedup: correlations of the paper's images at a reduced resolution from perturbed guesses, by
   one worker and by two;
 * overhead: cases that sleep for a second, on two workers: what the campaign takes beyond that.
 * start: cases that do nothing, run by forks of a server process, as campaigns are, and by new
@@ -10,7 +10,7 @@ Three questions, each answered by whole campaigns, their workers' start included
 
 The machine should have two idle cores.
 
-Run: scripts/env python benchmarks/campaign.py [--starts 24] [--sleeps 60] [--pixel 0.02]
+Run: scripts/env python benchmarks/campaign.py [--guesses 24] [--sleeps 60] [--pixel 0.02]
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def alone(
         return process.submit(run, function, cases, folder, workers, method).result()
 
 
-def speedup(starts: int, pixel: float, folder: Path) -> None:
+def speedup(guesses: int, pixel: float, folder: Path) -> None:
     """One worker against two."""
     from modeharvest.fem.field import Solution
     from modeharvest.runs.case import shipped_solution  # here: workers import this file, too
@@ -90,7 +90,7 @@ def speedup(starts: int, pixel: float, folder: Path) -> None:
     assert path is not None, "the case ships its solution"
     imaging = replace(case.imaging, pixel_size=pixel)
     subject = ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
-    study = RobustnessStudy(starts=starts, radii=(), strain_errors=())
+    study = RobustnessStudy(initial_guesses=guesses, radii=(), strain_errors=())
     found = {}
     for workers in (1, 2, 2, 1):  # so that a drift of the machine hits both alike
         own = folder / f"{workers}-{len(found)}-{time.perf_counter_ns()}"
@@ -134,13 +134,13 @@ def start(repetitions: int, folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--starts", type=int, default=24, help="correlations in each campaign")
+    parser.add_argument("--guesses", type=int, default=24, help="correlations in each campaign")
     parser.add_argument("--pixel", type=float, default=0.02, help="of their images [mm]")
     parser.add_argument("--sleeps", type=int, default=60, help="cases of a second")
     parser.add_argument("--repetitions", type=int, default=5, help="of the start, in turn")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        speedup(given.starts, given.pixel, Path(folder) / "speedup")
+        speedup(given.guesses, given.pixel, Path(folder) / "speedup")
         overhead(given.sleeps, Path(folder) / "overhead")
         start(given.repetitions, Path(folder) / "start")
 

@@ -173,8 +173,8 @@ def measure(truth: Truth, noise: Noise, seed: int, standard_start: bool) -> Real
     return Realisation(truth.bound(speckle, noise.in_f, noise.in_g), (plus, minus))
 
 
-def judge(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisation]) -> PairedErrors:
-    """Errors, what each result tells of them, and the bound."""
+def assess(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisation]) -> PairedErrors:
+    """Errors, what each result predicts of them, and the bound."""
     true = quantity.of(truth.a)
 
     def of_all(value: Callable[[Result], FloatArray]) -> FloatArray:
@@ -206,17 +206,19 @@ def study(pairs: int, standard_start: bool, only: str) -> dict[str, Any]:
     for noise in (noise for noise in NOISES if noise.name.startswith(only)):
         print(f"{noise.name} ...", file=sys.stderr, flush=True)
         made = [measure(truth, noise, seed, standard_start) for seed in range(pairs)]
-        judged = {part.name: judge(part, truth, noise, made) for part in parts}
+        assessed = {part.name: assess(part, truth, noise, made) for part in parts}
         results = [r for one in made for r in one.found]
-        unknowns = judged.pop("unknowns").standardised
+        unknowns = assessed.pop("unknowns").standardised
         rows[noise.name] = {
-            "bound_px": judged["u"].rms_bound * np.sqrt(2.0) / PIXEL,
+            "bound_px": assessed["u"].rms_bound * np.sqrt(2.0) / PIXEL,
             "blur_px": float(np.mean([r.weighting.blur_px for r in results])),
             "fields": {name: {"ratio": vars(part.ratio), "bias": vars(part.bias)}
-                       for name, part in judged.items()},
+                       for name, part in assessed.items()},
             "chi_square": vars(chi_square(truth, made)),
             "ratios": [float(unknowns.ratios.min()), float(unknowns.ratios.max())],
-            "told_over_error": unknowns.told_over_error,
+            "predicted_over_error": float(
+                np.sqrt((unknowns.predicted**2).mean() / (unknowns.errors**2).mean())
+            ),
             "coverage": vars(unknowns.coverage),
             "chi_square_of_residual": float(
                 np.mean([r.residual_test(noise.known).chi_square for r in results])
@@ -246,12 +248,12 @@ def tell(found: dict[str, Any]) -> None:
             print(f"| {noise} | {row['bound_px']:.2e} | {cells} |")
         print()
     print("| noise | blur of the gradient [px] | chi squared of the unknowns | each unknown's rms "
-          "error / bound | told standard error / rms error | share in 95 % intervals | chi "
+          "error / bound | predicted standard error / rms error | share in 95 % intervals | chi "
           "squared of the residual |\n|---|---|---|---|---|---|---|")  # fmt: skip
     for noise, row in found["noises"].items():
         print(f"| {noise} | {row['blur_px']:.2f} | {Estimate(**row['chi_square'])} | "
-              f"{row['ratios'][0]:.2f} – {row['ratios'][1]:.2f} | {row['told_over_error']:.3f} | "
-              f"{Estimate(**row['coverage'])} | "
+              f"{row['ratios'][0]:.2f} – {row['ratios'][1]:.2f} | "
+              f"{row['predicted_over_error']:.3f} | {Estimate(**row['coverage'])} | "
               f"{row['chi_square_of_residual']:.3f} |")  # fmt: skip
         if row["not_converged"]:
             print(f"{noise}: {row['not_converged']} correlations did not converge")

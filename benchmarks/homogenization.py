@@ -128,10 +128,10 @@ def computed() -> RVE:
 
 def cell() -> None:
     head("loading", "what", "homogenized", "lattice", "difference")
-    held = PlateLoading(sides="periodic", pattern_at_plates="free")
+    fixed = PlateLoading(sides="periodic", pattern_at_plates="free")
     loose = PlateLoading(plates="sliding", pattern_at_plates="free")
     for name, plates, loading in (
-        ("uniaxial strain", held, uniaxial_strain()),
+        ("uniaxial strain", fixed, uniaxial_strain()),
         ("uniaxial stress", loose, uniaxial()),
     ):
         body = HomogenizedBody.of_specimen(
@@ -481,8 +481,8 @@ def loads() -> None:
     ):
         macro = MacroLoading(((-c, 0.0), (shear, -lateral)))
         exact = critical_at(CellPath(primitive, macro), (np.pi, np.pi)).load
-        held = PlateLoading(c, shear, 0.0, lateral, sides=sides, pattern_at_plates="free")
-        body = HomogenizedBody.of_specimen(one, analytic(), held, divisions=(1, 1))
+        fixed = PlateLoading(c, shear, 0.0, lateral, sides=sides, pattern_at_plates="free")
+        body = HomogenizedBody.of_specimen(one, analytic(), fixed, divisions=(1, 1))
         found = homogenize(body, [1.05 * exact]).critical
         e = found.load if found else np.nan
         row(name, sides, f"{e:.6%}", f"{exact:.6%}", f"{e / exact - 1:.1e}")

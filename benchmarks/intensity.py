@@ -82,9 +82,9 @@ def point_errors(
     mesh: Mesh, displacement: FloatArray, grid: PixelGrid, speckle: Speckle, points: int
 ) -> dict[str, float]:
     """Largest differences at random pixels of the deformed image [fraction of full scale]."""
-    home = locate(mesh.nodes, mesh.cells, mesh.element, grid)
+    undeformed = locate(mesh.nodes, mesh.cells, mesh.element, grid)
     state = ImagedState(mesh, displacement, grid, speckle, 0.0)
-    rendering, truth = render_deformed(state, home)
+    rendering, truth = render_deformed(state, undeformed)
     some = np.random.default_rng(0).choice(np.flatnonzero(rendering.mask), points)
     X = truth.reference_point.reshape(-1, 2)[some]
     at = grid.to_px(X[:, 0], X[:, 1])

@@ -62,7 +62,7 @@ class Row:
     noise: float
     seed: int
     cutoff_px: float
-    held: dict[str, tuple[float, float]]
+    covered: dict[str, tuple[float, float]]
     """Shares in 95 % intervals."""
     error: dict[str, tuple[float, float]]
     deviation: dict[str, tuple[float, float]]
@@ -133,8 +133,8 @@ def measured(pair: ImagePair, specimen: Specimen, true: FloatArray, noise: float
 
     def of(name: str, there: NDArray[np.bool_]) -> tuple[float, float, float]:
         e, s = errors[name][there], bars[name][there]
-        held = float(np.mean(np.abs(e) < NORMAL_95 * s))
-        return held, float(np.sqrt(np.mean(e**2))), float(np.sqrt(np.mean(s**2)))
+        covered = float(np.mean(np.abs(e) < NORMAL_95 * s))
+        return covered, float(np.sqrt(np.mean(e**2))), float(np.sqrt(np.mean(s**2)))
 
     each = {name: [*zip(*map(partial(of, name), both), strict=True)] for name in errors}
     parts = ({name: values[k] for name, values in each.items()} for k in range(3))
@@ -149,17 +149,17 @@ def table(rows: list[Row]) -> None:
     print("|---" * 6 + "|")
     for noise in sorted({row.noise for row in rows}):
         own = [row for row in rows if row.noise == noise]
-        for name in own[0].held:
-            held = np.array([row.held[name] for row in own])
+        for name in own[0].covered:
+            covered = np.array([row.covered[name] for row in own])
             error, bar = (
                 np.sqrt(np.mean(np.square([getattr(row, what)[name] for row in own]), axis=0))
                 for what in ("error", "deviation")
             )
             unit, scale = (" px", 1.0) if name == "u" else (" ‰", 1e3)
-            sd = held.std(axis=0, ddof=min(1, len(own) - 1))
+            sd = covered.std(axis=0, ddof=min(1, len(own) - 1))
             shares = [
                 f"{100 * m:.1f} ± {100 * s:.1f} % (≥ {100 * least:.1f} %)"
-                for m, s, least in zip(held.mean(axis=0), sd, held.min(axis=0), strict=True)
+                for m, s, least in zip(covered.mean(axis=0), sd, covered.min(axis=0), strict=True)
             ]
             sizes = (" / ".join(f"{scale * v:.3g}" for v in pair) for pair in (error, bar))
             cells = [f"{100 * noise:g} %" if noise else "8 bit", name,

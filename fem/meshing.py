@@ -309,7 +309,7 @@ def _current_block() -> MeshBlock:
     return MeshBlock(nodes, np.searchsorted(used, cells).astype(np.int64))
 
 
-def mesh_outlines(
+def mesh_boundaries(
     parts: Collection[Collection[Collection[FloatArray]]], size: float, edge_size: float
 ) -> MeshBlock:
     """Mesh plane bodies bounded by smooth curves with T6 elements.
@@ -359,5 +359,5 @@ def _add_loop(loop: Collection[FloatArray], size: float) -> int:
 
 
 if __name__ == "__main__":  # so that a child can have a time limit: gmsh can't be interrupted
-    block = mesh_outlines(*pickle.load(sys.stdin.buffer))
+    block = mesh_boundaries(*pickle.load(sys.stdin.buffer))
     sys.stdout.buffer.write(pickle.dumps((block.nodes, block.cells)))

@@ -39,23 +39,23 @@ class PixelQuadrature:
 
 
 def integrate(
-    scene: ImagedState, aperture: Aperture, mask: BoolArray
+    state: ImagedState, aperture: Aperture, mask: BoolArray
 ) -> tuple[FloatArray, PixelQuadrature]:
     """(rows, cols) intensity averaged over pixels' apertures, and how; ``mask``: material."""
     near = near_edges(mask, aperture.reach_px)
     inside = mask & ~near
-    image = np.full(mask.shape, scene.background)
-    if scene.displacement is None:
-        image[inside] = scene.speckle.image(aperture.transfer)[inside]
+    image = np.full(mask.shape, state.background)
+    if state.displacement is None:
+        image[inside] = state.speckle.image(aperture.transfer)[inside]
         quadrature = PixelQuadrature(0, 0.0)
     else:
-        side, bound = points_a_side(aperture, scene.speckle.spec, scene.compression)
+        side, bound = points_a_side(aperture, state.speckle.spec, state.compression)
         nodes, weights = aperture.rule(side)
         offsets = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
-        image[inside] = scene.average(offsets, (weights[:, None] * weights).ravel(), inside)
+        image[inside] = state.average(offsets, (weights[:, None] * weights).ravel(), inside)
         quadrature = PixelQuadrature(side**2, bound)
     scattered = aperture.scattered()
-    image[near] = scene.average(scattered, np.full(EDGE_POINTS, 1.0 / EDGE_POINTS), near)
+    image[near] = state.average(scattered, np.full(EDGE_POINTS, 1.0 / EDGE_POINTS), near)
     return image, quadrature
 
 
@@ -129,7 +129,7 @@ class Camera:
         return cls(spec, None if lens is None else ideal_points(lens, shape), folder)
 
     def expose(
-        self, ideal: Rendering, scene: ImagedState, name: str, mask_name: str
+        self, ideal: Rendering, state: ImagedState, name: str, mask_name: str
     ) -> ImageRecord:
         """Write what the camera makes of a scene, of which a perfect lens shows ``ideal``.
 
@@ -137,12 +137,12 @@ class Camera:
         """
         observed = ideal
         if self.points is not None:
-            shown = render_observed(scene, self.points)
+            shown = render_observed(state, self.points)
             observed = replace(shown, doubly_covered=ideal.doubly_covered)
         sensor, bits, mask = self.spec.sensor, self.spec.bits, observed.mask
         irradiance, quadrature, light = observed.image, None, None
         if not sensor.aperture.is_point:
-            averaged, quadrature = integrate(scene, sensor.aperture, mask)
+            averaged, quadrature = integrate(state, sensor.aperture, mask)
             irradiance = averaged.astype(np.float32)
         if sensor.flicker > 0.0:
             light = sensor.illumination(name)

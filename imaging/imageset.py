@@ -281,15 +281,15 @@ def _write_set(
     grid = choose_grid(solution, strains, spec)
     located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "undeformed mesh")
     speckle = Speckle(spec.speckle, grid.shape)
-    scene = ImagedState(mesh, None, grid, speckle, spec.background, "undeformed mesh")
+    state = ImagedState(mesh, None, grid, speckle, spec.background, "undeformed mesh")
     camera = Camera.of(spec, grid.shape, folder)
-    ideal = render_reference(scene, located)
-    reference = camera.expose(ideal, scene, "reference", "mask.tif")
+    ideal = render_reference(state, located)
+    reference = camera.expose(ideal, state, "reference", "mask.tif")
     snapshots = []
     for k, strain in enumerate(strains):
         report(1 + k, steps, f"images: strain {100 * strain:.2f} %")
         where = f"snapshot at strain {strain:.4f}"
-        moved = replace(scene, displacement=solution.at(strain).displacement, where=where)
+        moved = replace(state, displacement=solution.at(strain).displacement, where=where)
         snapshots.append(_write_snapshot(camera, moved, solution.at(strain), strain, located))
     residuals, records = [s.inverse_map_max_residual_px for s in snapshots], [reference, *snapshots]
     plain = [{n: v for n, v in asdict(record).items() if v is not None} for record in records]
@@ -315,13 +315,13 @@ def _write_set(
 
 
 def _write_snapshot(
-    camera: Camera, scene: ImagedState, snapshot: Snapshot, strain: float, located: Located
+    camera: Camera, state: ImagedState, snapshot: Snapshot, strain: float, located: Located
 ) -> SnapshotRecord:
     """Write one deformed image, its mask and its truth; ``located`` is the reference's."""
-    ideal, truth = render_deformed(scene, located)
+    ideal, truth = render_deformed(state, located)
     name, truth_name = f"deformed_{_label(strain)}", f"truth_{_label(strain)}.h5"
-    record = camera.expose(ideal, scene, name, f"{name}_mask.tif")
-    truth.write(camera.folder / truth_name, strain, scene.grid)
+    record = camera.expose(ideal, state, name, f"{name}_mask.tif")
+    truth.write(camera.folder / truth_name, strain, state.grid)
     return SnapshotRecord(
         **vars(record),
         nominal_strain=float(strain),

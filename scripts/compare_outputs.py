@@ -46,7 +46,7 @@ COMMANDS = {
 RENAMED = Path(__file__).with_name("renamed_outputs.toml")
 NOT_COMPUTED = {"timings.json", "stages.json"}
 READ = {".json", ".csv", ".npz", ".tif", ".tiff", ".h5", ".vtu"}
-SENTENCE = "a sentence"
+PROSE = "a sentence"
 DIGEST = re.compile(r"[0-9a-f]{12,64}")
 LEAST_WORDS = 4
 """A text of that many words is a sentence for readers."""
@@ -162,7 +162,7 @@ def difference(before: object, now: object, tolerance: float) -> str:
         unlike = [(x, y) for x, y in pairs if x != y and not DIGEST.fullmatch(x)]
         if any(len(x.split()) < LEAST_WORDS for x, _ in unlike):
             return f"{len(unlike)} of {one.size} differ, e.g. {unlike[0]}"
-        return f"{SENTENCE}: {unlike[0][0]!r} is now {unlike[0][1]!r}" if unlike else ""
+        return f"{PROSE}: {unlike[0][0]!r} is now {unlike[0][1]!r}" if unlike else ""
     one, other = one.astype(complex), other.astype(complex)
     equal = (one == other) | (np.isnan(one) & np.isnan(other))
     with np.errstate(invalid="ignore"):
@@ -201,7 +201,7 @@ def compare(before: Path, after: Path, tolerance: float) -> int:
             what = "missing" if name is None else difference(value, now.pop(name), tolerance)
             if what:
                 print(f"{path}: {key}: {what}")
-                differences += not what.startswith(SENTENCE)
+                differences += not what.startswith(PROSE)
         for key in now:
             print(f"{path}: {key}: new")
     print(f"{len(files)} files, {values} values and arrays compared: {differences} differences")

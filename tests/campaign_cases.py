@@ -20,7 +20,7 @@ def square(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
     return {"square": case["x"] ** 2, "process": os.getpid()}
 
 
-def held(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
+def holding(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
     """Wait, from x = 5 on, until a file says to go on."""
     while case["x"] >= 5 and not (folder / "go").exists():
         time.sleep(0.02)

@@ -43,10 +43,10 @@ def holed_cell(
     corners = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1], [1, -1]]) @ half_lattice
     t = np.arange(around) / (2.0 * divisions)
     side = t.astype(int)
-    outline = corners[side] + (t - side)[:, None] * (corners[side + 1] - corners[side])
-    hole = radius * outline / np.linalg.norm(outline, axis=1)[:, None]
+    boundary = corners[side] + (t - side)[:, None] * (corners[side + 1] - corners[side])
+    hole = radius * boundary / np.linalg.norm(boundary, axis=1)[:, None]
     s = np.arange(outward)[:, None, None] / (outward - 1.0)
-    nodes = ((1.0 - s) * hole + s * outline).reshape(-1, 2)
+    nodes = ((1.0 - s) * hole + s * boundary).reshape(-1, 2)
     cells = np.array(
         [
             cell

@@ -93,7 +93,7 @@ def frame(name: str, strain: float, amplitude: float, fixed: bool = False) -> Ha
         residual_correlation=0.1, slope_square=1e13 * GRID.pixel_size**2 / int(MASK.sum()),
     )  # fmt: skip
     x, y = GRID.x[::8], GRID.y[::8]
-    leftover = 1e-8 * np.eye(kinematics.size)
+    model_error = 1e-8 * np.eye(kinematics.size)
     u = result.displacement() + wave()
     spectrum = spectral_density(u, GRID, MASK, PITCH)
     rng = np.random.default_rng(1)
@@ -111,7 +111,7 @@ def frame(name: str, strain: float, amplitude: float, fixed: bool = False) -> Ha
         error_x=x,
         error_y=y,
         by_noise=field_errors(result, x, y, result.covariance(NOISE)),
-        by_model_error=field_errors(result, x, y, leftover),
+        by_model_error=field_errors(result, x, y, model_error),
         spectrum=spectrum,
         pattern=read_pattern(spectrum),
         w=replace(local, u=noisy, sd=np.full(noisy.shape, 1e-4)).less(

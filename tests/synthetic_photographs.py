@@ -32,7 +32,7 @@ class Photographed:
     ----------
     grid
         Pixels of the photographs.
-    outline
+    boundary
         Of the specimen [mm].
     holes
         (n, 2) centres [mm].
@@ -43,7 +43,7 @@ class Photographed:
     """
 
     grid: PixelGrid
-    outline: Box
+    boundary: Box
     holes: FloatArray
     diameter: float
     seed: int = 2
@@ -51,8 +51,8 @@ class Photographed:
     def material(self, points: FloatArray) -> NDArray[np.bool_]:
         """(rows, cols) whether points (rows, cols, 2) of the reference are material."""
         x, y = points[..., 0], points[..., 1]
-        inside = (abs(x - self._middle[0]) < self.outline.half[0]) & (
-            abs(y - self._middle[1]) < self.outline.half[1]
+        inside = (abs(x - self._middle[0]) < self.boundary.half[0]) & (
+            abs(y - self._middle[1]) < self.boundary.half[1]
         )
         for a, b in self.holes:
             inside &= np.hypot(x - a, y - b) > 0.5 * self.diameter
@@ -60,7 +60,7 @@ class Photographed:
 
     @property
     def _middle(self) -> tuple[float, float]:
-        box = self.outline
+        box = self.boundary
         return 0.5 * (box.x_min + box.x_max), 0.5 * (box.y_min + box.y_max)
 
     @property

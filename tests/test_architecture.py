@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,21 @@ def test_the_code_keeps_its_contracts() -> None:
     result = lint_imports(PROJECT)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "0 broken" in result.stdout
+
+
+def test_every_inner_layer_has_its_contract() -> None:
+    """Each package of three modules or more says which of them may import which."""
+    settings = tomllib.loads((PROJECT / "pyproject.toml").read_text("utf-8"))["tool"][
+        "importlinter"
+    ]
+    layered = {name for each in settings["contracts"] for name in each.get("containers", ())}
+    root = PROJECT / "src/modeharvest"
+    for folder, _, files in os.walk(root, followlinks=True):
+        found = [Path(folder, name).parent for name in files if name.endswith(".py")]
+        inner = [path for path in Path(folder).iterdir() if (path / "__init__.py").is_file()]
+        if len(found) + len(inner) > 3:  # one is __init__
+            package = ".".join(("modeharvest", *Path(folder).relative_to(root).parts))
+            assert package in layered
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ def test_what_differs_stays_free() -> None:
     found = mode_family(HEXAGONAL_MESH, OBLIQUE * TWO, field(HEXAGONAL_MESH, waves), PITCH)
     assert_is_field(found, HEXAGONAL_MESH, field(HEXAGONAL_MESH, waves))
     assert found.family.size == 15 - 4  # three L are zero, the largest T is held
-    assert not any("is the same" in sentence for sentence in found.text)
+    assert not any("is the same" in message for message in found.text)
 
 
 def test_components_out_of_phase_become_two_waves() -> None:
@@ -189,7 +189,7 @@ def test_components_out_of_phase_become_two_waves() -> None:
     assert found.family.names == ("T2", "kx1", "ky1", "c1", "c2")
     k = found.family.matrix[:, 1].reshape(-1, 5)
     assert np.array_equal(k, [[0, 0, 1, 0, 0], [0, 0, 1, 0, 0]])
-    assert any("out of phase" in sentence for sentence in found.text)
+    assert any("out of phase" in message for message in found.text)
 
 
 def found_mean(found: FoundFamily, u: np.ndarray) -> np.ndarray:

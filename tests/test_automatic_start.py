@@ -15,7 +15,7 @@ from modeharvest.idic.ansatz import AnsatzOptions
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.local.motion import first_motion, outline_motion, robust_fit
+from modeharvest.idic.local.motion import edge_motion, first_motion, robust_fit
 from modeharvest.idic.modes import FourierMode
 from modeharvest.idic.photograph.geometry import Geometry, SpecimenTable, find_geometry
 from modeharvest.idic.photograph.initial_guess import (
@@ -76,7 +76,7 @@ def test_images_alone_lead_where_the_papers_start_leads(images: ImageSet) -> Non
     assert np.sqrt(np.mean(apart**2)) < 2e-3
 
 
-def test_without_a_pattern_the_mode_is_held(images: ImageSet) -> None:
+def test_without_a_pattern_the_mode_is_fixed(images: ImageSet) -> None:
     """Before buckling, at 7.8 %: the lattice's own pattern, its origin on a junction, held."""
     start = start_of(images, 0.078)
     assert start.ansatz.fixed
@@ -120,9 +120,9 @@ def test_hole_centres_are_used_and_strays_set_aside(images: ImageSet) -> None:
     u[7] += 3.0  # a hole taken for another
     u[9] = np.nan
     domain = Box.centred(15.2, 20.8)
-    motion, sentence = first_motion(domain, pair, LocalField(*centres.T, u))
-    assert "the motion of 59 hole centres: a polynomial of degree 3" in sentence
-    assert "2 of 118 components set aside" in sentence
+    motion, message = first_motion(domain, pair, LocalField(*centres.T, u))
+    assert "the motion of 59 hole centres: a polynomial of degree 3" in message
+    assert "2 of 118 components set aside" in message
     off = motion(np.stack(np.meshgrid(grid.x, grid.y), -1)) - images.truth(0.128).displacement
     # The best cubic through all the material leaves 2.0 px, the pattern; here the solid strips
     # beyond the holes are extrapolated.
@@ -256,20 +256,20 @@ def test_options_are_what_the_ansatz_can_say() -> None:
     assert ansatz.domain == Box(*GRID.extent)
 
 
-def test_outlines_give_stretch_and_translation() -> None:
+def test_boundaries_give_stretch_and_translation() -> None:
     before = np.zeros(GRID.shape, dtype=bool)
     before[50:250, 40:180] = True
     before[100:120, 60:80] = False  # a hole
     after = np.zeros(GRID.shape, dtype=bool)
     after[44:264, 60:186] = True
-    affine = outline_motion(before, after, GRID)
+    affine = edge_motion(before, after, GRID)
     assert affine is not None
     np.testing.assert_allclose([affine[0, 1], affine[1, 2]], [-0.1, 0.1], atol=1e-4)
     x, y = GRID.to_mm(149.5, 109.5)
     moved = affine @ [1.0, float(x), float(y)]
     np.testing.assert_allclose(moved, [13 * 0.06, -4 * 0.06], atol=1e-9)
     before[0, 100] = True
-    assert outline_motion(before, after, GRID) is None
+    assert edge_motion(before, after, GRID) is None
 
 
 def test_stray_values_hardly_move_a_robust_fit() -> None:
@@ -302,7 +302,7 @@ def chosen(vectors: np.ndarray, how: PhotographOptions) -> tuple[Geometry, Fouri
 
 @pytest.mark.parametrize("height", [1.9, 2.4])
 @pytest.mark.parametrize("how", [{"family": "square"}, {"fixed_mode": False}])
-def test_eq_mode_starts_on_the_lattice_of_the_holes(height: float, how: dict[str, object]) -> None:
+def test_eq_mode_begins_on_the_lattice_of_the_holes(height: float, how: dict[str, object]) -> None:
     geometry, mode = chosen(np.diag([1.9, height]), PhotographOptions(**how))
     assert mode.family.size == (7 if "fixed_mode" in how else 0)  # none is observable
     rows = mode.family.waves(mode.family.start)

@@ -232,7 +232,7 @@ def test_meshes_that_never_end_are_refused(
     ],
     ids=lambda call: " ".join(call)[:60],
 )
-def test_a_bad_call_is_told_in_one_line(
+def test_a_bad_call_is_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path,
     call: tuple[str, ...],
 ) -> None:  # fmt: skip
@@ -307,7 +307,7 @@ def test_a_file_or_nothing_is_no_folder_to_write_to(
         ("cell_size = 0.2", "cell_size = 0.2\n[distortion]\nfile = 'folder.toml'"),
     ],
 )
-def test_a_bad_experiment_is_told_in_one_line(
+def test_a_bad_experiment_is_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path,
     tmp_path: Path, old: str, new: str,
 ) -> None:  # fmt: skip
@@ -394,7 +394,7 @@ def test_names_that_look_like_markup_or_formulas_are_scored(
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_whatever_ends_a_command_is_told_in_one_line(
+def test_whatever_ends_a_command_is_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path,
     error: BaseException, code: int, said: str,
 ) -> None:  # fmt: skip
@@ -523,7 +523,7 @@ def test_ctrl_c_counts_even_at_the_end() -> None:
 # --- environments -------------------------------------------------------------------------
 
 
-def test_without_a_home_there_is_still_help() -> None:
+def test_help_needs_no_folder_of_the_user() -> None:
     done = run("-m modeharvest cases", HOME=None, XDG_CACHE_HOME=None)
     assert done.returncode == 0
     assert "paper-virtual" in done.stdout

@@ -243,7 +243,7 @@ def test_a_campaign_opens_nothing_beyond_this_machine(tmp_path: Path) -> None:
 
 def half_done(folder: Path) -> Campaign:
     """Of eight cases, five end by themselves."""
-    return Campaign("campaign_cases:held", grid({"x": 0}, x=list(range(8))), folder)
+    return Campaign("campaign_cases:holding", grid({"x": 0}, x=list(range(8))), folder)
 
 
 def test_a_run_killed_goes_on_where_it_was(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_plain_values_make_the_same_case_again() -> None:
         ("[experiment", "not valid TOML"),
     ],
 )
-def test_a_wrong_case_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_case_is_reported_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(InputError) as caught:
         Case.read(written(tmp_path, text))
     message = str(caught.value)

@@ -29,7 +29,7 @@ def two_squares(gap: float) -> Solution:
 
 
 @pytest.mark.parametrize(("gap", "overlaps"), [(0.55, False), (-0.55, True)])
-def test_a_specimen_that_overlaps_itself_is_told(
+def test_a_specimen_that_overlaps_itself_is_reported(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,

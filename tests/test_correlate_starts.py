@@ -46,7 +46,7 @@ def test_the_standard_start_finds_the_truth() -> None:
 
 
 @pytest.mark.parametrize("cells", [0.2, 0.5, 0.8])
-def test_a_wave_shifted_by_part_of_a_cell_slides_home(cells: float) -> None:
+def test_a_wave_shifted_by_part_of_a_cell_slides_back(cells: float) -> None:
     ansatz, truth, f, g = case()
     start = ansatz.initial_guess(STRAIN, 1.0)
     start[ansatz.phi_slice(0)][5] += cells
@@ -99,7 +99,7 @@ def test_two_modes(seed: int) -> None:
     np.testing.assert_allclose(result.mode_parameters(1), truth[-4:], atol=1e-5)
 
 
-def test_a_trapped_iteration_says_so() -> None:
+def test_a_in_a_local_minimum_iteration_says_so() -> None:
     ansatz, truth, f, g = case()
     start = ansatz.initial_guess(STRAIN, 1.0)
     start[ansatz.v0_slice(1)][0] += 0.25  # 25 px, two speckles and a half

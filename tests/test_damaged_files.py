@@ -454,7 +454,7 @@ def _peak_bytes(*, reset: bool = False) -> float:
     return 1e3 * float(peak)
 
 
-def test_a_file_that_crashes_its_parser_is_told_in_a_line(
+def test_a_file_that_crashes_its_parser_is_reported_in_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     script = tmp_path / "child.py"

@@ -154,9 +154,9 @@ def attempts(
     assert forks.stdout is not None
     print(json.dumps([listed, "disk", command]), file=forks.stdin, flush=True)
     every = []
-    while isinstance(told := json.loads(forks.stdout.readline()), dict):
-        every.append(told)
-    assert told in (0, disturbed.NO_DISK)
+    while isinstance(reported := json.loads(forks.stdout.readline()), dict):
+        every.append(reported)
+    assert reported in (0, disturbed.NO_DISK)
     return [[a for a in every if a["folder"] == str(folder / name)] for name in ways]
 
 

@@ -115,11 +115,11 @@ def test_examples_of_white_noise_give_the_cramer_rao_bound() -> None:
     rng = np.random.default_rng(8)
     examples = [np.float32(little * rng.normal(size=(2, *f.shape))) for _ in range(12)]
     covariance = matched(result, f, g).noise_covariance(((n[0], n[1]) for n in examples), 0.25)
-    told, bound = (
+    stated, bound = (
         field_errors(result, X, Y, c).displacement for c in (covariance, result.covariance(little))
     )
     # 12 examples of 150 blocks each: a few per cent; the noise of g weighs 1/det F, 5 %, more.
-    assert np.sqrt(np.mean(told**2) / np.mean(bound**2)) == pytest.approx(1.0, abs=0.12)
+    assert np.sqrt(np.mean(stated**2) / np.mean(bound**2)) == pytest.approx(1.0, abs=0.12)
 
 
 @pytest.mark.parametrize(("model_error", "sd"), [(0.0, 0.01), (0.01, 0.02)])
@@ -138,13 +138,13 @@ def test_seeds_of_noise_scatter_as_the_curvature_predicts(model_error: float, sd
                 ImagePair(*images, GRID, MASK), result.ansatz, guess=result.unknowns, options=FINEST
             ).unknowns
         )
-    told, seen = (
+    stated, seen = (
         np.sqrt(np.mean(field_errors(result, X, Y, c).displacement ** 2))
         for c in (predicted, np.cov(np.array(ends).T))
     )
     # 19 degrees of freedom over a dozen independent places: 5 %; noise adds some second
     # order (docs/metrology.md).
-    assert told == pytest.approx(seen, rel=0.2)
+    assert stated == pytest.approx(seen, rel=0.2)
 
 
 def test_a_model_error_lowers_the_curvature() -> None:

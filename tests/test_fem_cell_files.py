@@ -293,7 +293,7 @@ def test_the_recipes_work_as_printed(
     assert area(space["slotted"]) == pytest.approx(3.2 - 0.48 + (4 - math.pi) * 0.15**2, rel=1e-3)
 
 
-def test_a_file_that_crashes_gmsh_is_told_in_a_line(
+def test_a_file_that_crashes_gmsh_is_reported_in_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("modeharvest.fem.lattice.files._PROBE", "import os; os.abort()")

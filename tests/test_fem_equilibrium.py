@@ -145,11 +145,11 @@ def test_forces_and_stiffness_are_derivatives_of_the_energy(material: Material) 
     K = structure.stiffness(u)
     assert step.dot(K * other) == pytest.approx(other.dot(K * step), rel=1e-12)
     # The load direction is the derivative with respect to the strain.
-    held = structure.zero()
-    structure.prescribe(held, 1.0)
+    fixed = structure.zero()
+    structure.prescribe(fixed, 1.0)
     ahead, behind = u.copy(), u.copy()
-    ahead.axpy(h, held)
-    behind.axpy(-h, held)
+    ahead.axpy(h, fixed)
+    behind.axpy(-h, fixed)
     difference = (structure.residual(ahead) - structure.residual(behind)) * (0.5 / h)
     assert (structure.load(u) - difference).norm() < 1e-7 * difference.norm()
 
@@ -251,7 +251,7 @@ def test_reaction_is_the_slope_of_the_energy(edges: str) -> None:
     assert (rate - mid.tangent).norm() < 1e-5 * mid.tangent.norm()
 
 
-def test_where_no_node_is_at_mid_height_sliding_edges_are_held_by_the_nearest() -> None:
+def test_where_no_node_is_at_mid_height_sliding_edges_are_fixed_by_the_nearest() -> None:
     """An even number of staggered rows: the specimen and its mirror image behave alike.
 
     In both the upper one of the two nearest nodes is held; it is not the same one of the specimen.
@@ -267,8 +267,8 @@ def test_where_no_node_is_at_mid_height_sliding_edges_are_held_by_the_nearest() 
         structure = Structure(body, Ogden(), loading)
         u = structure.nodal(equilibrium(structure, 0.02).u)
         left = np.abs(body.nodes[:, 0] + specimen.half_size[0]) < 1e-9
-        held = left & (np.abs(u[:, 1]) < 1e-14)
-        assert body.nodes[held, 1] == pytest.approx([np.abs(on_edge).min()])
+        fixed = left & (np.abs(u[:, 1]) < 1e-14)
+        assert body.nodes[fixed, 1] == pytest.approx([np.abs(on_edge).min()])
         found.append(u)
     apart = found[0] - found[1] * [1.0, -1.0]
     np.testing.assert_allclose(apart - apart[0], 0.0, atol=1e-9)  # but for a translation

@@ -43,9 +43,9 @@ from modeharvest.util.errors import InputError
 FloatArray = NDArray[np.float64]
 PITCH, JUNCTION = 1.9, (0.95, 0.95)
 PATTERN = rotation_pattern(PITCH)
-HELD = PlateLoading(sides="periodic", pattern_at_plates="free")
+FIXED = PlateLoading(sides="periodic", pattern_at_plates="free")
 LOOSE = PlateLoading(plates="sliding", pattern_at_plates="free")
-CELL_LOADS = {HELD: uniaxial_strain(), LOOSE: uniaxial()}
+CELL_LOADS = {FIXED: uniaxial_strain(), LOOSE: uniaxial()}
 
 
 @cache
@@ -88,7 +88,7 @@ def relaxed(
     raise AssertionError
 
 
-@pytest.mark.parametrize("loading", [HELD, LOOSE])
+@pytest.mark.parametrize("loading", [FIXED, LOOSE])
 def test_a_homogeneous_pattern_grows_from_the_load_that_bloch_waves_say(
     loading: PlateLoading,
 ) -> None:
@@ -99,7 +99,7 @@ def test_a_homogeneous_pattern_grows_from_the_load_that_bloch_waves_say(
     assert found.load == pytest.approx(bloch_critical(CELL_LOADS[loading]), rel=1e-6)
 
 
-@pytest.mark.parametrize("loading", [HELD, LOOSE])
+@pytest.mark.parametrize("loading", [FIXED, LOOSE])
 def test_a_homogeneous_branch_is_that_of_the_periodic_cell(loading: PlateLoading) -> None:
     load = CELL_LOADS[loading]
     primitive = PeriodicCell(square(PITCH, 1.5, 0.4), Ogden())
@@ -164,7 +164,7 @@ def test_a_turned_rve_has_no_stress() -> None:
 
 def test_without_modes_it_is_first_order_homogenization() -> None:
     """The first RVE to become unstable does so where Bloch waves of its period say."""
-    found = homogenize(lattice_body(RVE(cell(), Ogden(), [], JUNCTION), HELD), [0.06])
+    found = homogenize(lattice_body(RVE(cell(), Ogden(), [], JUNCTION), FIXED), [0.06])
     assert found.critical is not None
     assert found.critical.kind == "RVE"
     assert found.critical.load == pytest.approx(bloch_critical(uniaxial_strain()), rel=1e-5)
@@ -232,7 +232,7 @@ def test_of_two_critical_modes_no_branch_is_followed_twice() -> None:
     lattice, material = hexagonal(1.9, 1.7, 0.5), Ogden()
     modes = rve_modes(lattice, material)
     element = RVE(lattice.enlarged(2, 2), material, modes, (0.0, 0.0))
-    body = HomogenizedBody(rectangle_mesh([0, 1], [0, 1]), element, HELD)
+    body = HomogenizedBody(rectangle_mesh([0, 1], [0, 1]), element, FIXED)
     found = homogenize(body, [0.04], PathOptions(first_step=0.01, largest_step=0.01))
     assert found.critical is not None
     assert (len(found.critical.modes), found.critical.negative_after) == (2, 2)
@@ -338,7 +338,7 @@ def test_positions_of_the_rve_are_averaged() -> None:
     """A pitch further the mode has the other sign; the mean is about neither."""
     there = RVE(cell(), Ogden(), [PATTERN], (0.95 + PITCH, 0.95))
     specimen = Specimen(2, 2, bulk_x=0.0, bulk_y=0.0)
-    both = HomogenizedBody.of_specimen(specimen, [rve(), there], HELD, divisions=(1, 1))
+    both = HomogenizedBody.of_specimen(specimen, [rve(), there], FIXED, divisions=(1, 1))
     found = homogenize(both, [0.06])
     assert found.critical is not None
     assert found.critical.load == pytest.approx(bloch_critical(uniaxial_strain()), rel=1e-6)
@@ -447,7 +447,7 @@ def test_a_mesh_of_any_element_is_read_and_buckles_as_the_lattice_does(
     mesh, is_lattice, edges = read_body_mesh(tmp_path / "m.vtu")
     assert (mesh.element, is_lattice.all(), edges) == (element, True, {})
     assert quadrature(mesh, 2).weights.sum() == pytest.approx(12)
-    found = homogenize(HomogenizedBody(mesh, rve(), HELD), [0.06]).critical
+    found = homogenize(HomogenizedBody(mesh, rve(), FIXED), [0.06]).critical
     assert found is not None
     assert found.load == pytest.approx(bloch_critical(uniaxial_strain()), rel=1e-6)
 
@@ -510,7 +510,7 @@ def test_bodies_and_loadings_that_will_not_do_are_refused() -> None:
         HomogenizedBody(on_tips, rve(), LOOSE)
     with pytest.raises(InputError, match="positive Jacobians"):
         HomogenizedBody(inside_out, rve(), LOOSE)
-    two_points = HomogenizedBody(Mesh(*nine_nodes(), "Q9"), rve(), HELD, points=2)
+    two_points = HomogenizedBody(Mesh(*nine_nodes(), "Q9"), rve(), FIXED, points=2)
     with pytest.raises(InputError, match=r"stable without load.* take more points"):
         HomogenizedPath(two_points)
     with pytest.raises(InputError, match="as many modes"):
@@ -528,4 +528,4 @@ def test_bodies_and_loadings_that_will_not_do_are_refused() -> None:
         with pytest.raises(InputError):
             PlateLoading(**bad)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="ascending"):
-        homogenize(lattice_body(rve(), HELD), [0.1, 0.05])
+        homogenize(lattice_body(rve(), FIXED), [0.1, 0.05])

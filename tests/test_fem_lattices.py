@@ -53,9 +53,9 @@ def state_at(cell: UnitCell, loading: MacroLoading, load: float) -> tuple[Period
 @cells
 def test_every_node_is_its_master_moved_by_lattice_vectors(cell: UnitCell) -> None:
     found, nodes = cell.periodicity, cell.mesh.nodes
-    home = nodes - found.shift @ cell.lattice
+    origins = nodes - found.shift @ cell.lattice
     for k in range(found.count):
-        assert np.ptp(home[found.master == k], axis=0).max() < 1e-9
+        assert np.ptp(origins[found.master == k], axis=0).max() < 1e-9
 
 
 @cells
@@ -92,7 +92,7 @@ def test_the_area_of_material_converges_with_the_fourth_order(
     assert error(1 / 16) < error(1 / 8) / 10  # 16 in the limit
 
 
-def test_an_outline_through_holes_is_accepted() -> None:
+def test_an_boundary_through_holes_is_accepted() -> None:
     cell = between_holes()
     assert cell.periodicity.count == SQUARE.periodicity.count
 

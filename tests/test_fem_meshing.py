@@ -257,8 +257,8 @@ def test_scatter_of_a_graded_specimen_leaves_its_edges_and_topology() -> None:
     assert np.array_equal(scattered.nodes[outer], mesh.nodes[outer])
     assert smallest_bernstein(scattered) > 0.0
     for centre, diameter in zip(GRADED.hole_centres, GRADED.diameters, strict=True):
-        rim = np.abs(np.linalg.norm(mesh.nodes - centre, axis=1) - 0.5 * diameter) < 1e-12
-        points = scattered.nodes[rim] - centre
+        hole_edge = np.abs(np.linalg.norm(mesh.nodes - centre, axis=1) - 0.5 * diameter) < 1e-12
+        points = scattered.nodes[hole_edge] - centre
         system = np.column_stack([2 * points, np.ones(len(points))])
         square = np.sum(points**2, axis=1)
         solution, *_ = np.linalg.lstsq(system, square)
@@ -273,9 +273,9 @@ def test_scatter_moves_holes_but_neither_edges_nor_topology() -> None:
     assert np.array_equal(scattered.nodes[outer], mesh.nodes[outer])
     assert smallest_bernstein(scattered) > 0.0
     for centre in SMALL.hole_centres:
-        rim = np.abs(np.linalg.norm(mesh.nodes - centre, axis=1) - 0.75) < 1e-12
+        hole_edge = np.abs(np.linalg.norm(mesh.nodes - centre, axis=1) - 0.75) < 1e-12
         # Least squares circle: |p|^2 = 2 p . c + (r^2 - |c|^2) is exact for a circle.
-        points = scattered.nodes[rim] - centre
+        points = scattered.nodes[hole_edge] - centre
         system = np.column_stack([2 * points, np.ones(len(points))])
         square = np.sum(points**2, axis=1)
         solution, *_ = np.linalg.lstsq(system, square)
@@ -293,8 +293,8 @@ def test_scatter_has_the_stated_deviation_and_seed() -> None:
     mesh = mesh_specimen(specimen, 0.29)
     deviation = 0.01
     scattered = perturb(mesh, specimen, Imperfection(position_sd=deviation, seed=1))
-    rim = on_hole(mesh.nodes, specimen)
-    moved = (scattered.nodes - mesh.nodes)[rim]
+    hole_edge = on_hole(mesh.nodes, specimen)
+    moved = (scattered.nodes - mesh.nodes)[hole_edge]
     # 240 coordinates: their standard deviation is known to 1/sqrt(480) = 4.6 %; three of these.
     assert np.std(moved) == pytest.approx(deviation, rel=0.14)
     again = perturb(mesh, specimen, Imperfection(position_sd=deviation, seed=1))

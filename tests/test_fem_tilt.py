@@ -112,13 +112,13 @@ def test_guide_holds_the_junctions_at_mid_height_and_nothing_else() -> None:
     free = simulate(Experiment(SMALL, strains=(0.1,), mesh_size=0.5, tilt=0.2))
     x, y = guided.mesh.nodes.T
     u, without = guided.at(0.1).displacement, free.at(0.1).displacement
-    held = np.zeros(x.size, dtype=np.bool_)
+    fixed = np.zeros(x.size, dtype=np.bool_)
     for junction in (-SMALL.pitch, 0.0, SMALL.pitch):
-        held |= np.hypot(x - junction, y) < 1e-9
-    assert held.sum() == 3
-    np.testing.assert_array_equal(u[held, 1], 0.0)
-    assert np.abs(without[held, 1]).min() > 1e-4
-    assert np.ptp(u[held, 0]) > 0.1  # free to move along the rail
+        fixed |= np.hypot(x - junction, y) < 1e-9
+    assert fixed.sum() == 3
+    np.testing.assert_array_equal(u[fixed, 1], 0.0)
+    assert np.abs(without[fixed, 1]).min() > 1e-4
+    assert np.ptp(u[fixed, 0]) > 0.1  # free to move along the rail
     assert guided.at(0.1).energy > free.at(0.1).energy
 
 

@@ -77,7 +77,7 @@ def test_sensitivities_against_differences(seed: int) -> None:
     np.testing.assert_allclose(mode.sensitivities(a, x, y), differences, atol=5e-6)
 
 
-def test_free_family_starts_where_told_and_holds_the_largest_amplitude() -> None:
+def test_free_family_begins_where_reported_and_holds_the_largest_amplitude() -> None:
     waves = np.array([[0.2, -0.9, 1.0, 0.0, 0.1], [0.5, 0.3, 0.0, 1.0, 0.2]])
     family = free_family(waves)
     np.testing.assert_array_equal(family.waves(family.start), waves)

@@ -133,7 +133,7 @@ def test_a_step_that_leaves_the_image_is_refused() -> None:
     assert 9 < np.linalg.norm(found.unknowns) <= 10
 
 
-def test_every_outcome_is_explained_in_a_sentence() -> None:
+def test_every_outcome_has_a_text() -> None:
     explanations = [outcome.explanation for outcome in Outcome]
     assert len(set(explanations)) == len(Outcome)
     assert all(text[0].isupper() and text.endswith(".") for text in explanations)

@@ -196,7 +196,7 @@ def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) ->
         assert np.abs(local.u - truth).max() < 1e-6 * PITCH
 
 
-def test_repeats_between_which_something_moved_are_told() -> None:
+def test_repeats_between_which_something_moved_are_reported() -> None:
     """Half a pixel looks like noise, but not like that of a single photograph."""
     shown = scene()
     still, moved = (

@@ -187,11 +187,11 @@ def test_a_column_that_leaves_the_image_does_not_move_the_lattice_by_a_cell(
     With the specimen's edge in the image both match as many holes; without it, where a column
     enters at the other side, the wrong answer matches more.
     """
-    outline = Box(-5.8 if edge else -30.0, 30.0, -30.0, 30.0)
+    boundary = Box(-5.8 if edge else -30.0, 30.0, -30.0, 30.0)
     holes = lattice_points(PITCH * np.eye(2), Box(-5.0, 12.0, -12.0, 12.0), (0.0, 0.0))
     if not edge:
         holes = lattice_points(PITCH * np.eye(2), Box.centred(30.0, 24.0), (0.0, 0.0))
-    scene = Photographed(PixelGrid.centred(275, 333, PIXEL), outline, holes, 1.4)
+    scene = Photographed(PixelGrid.centred(275, 333, PIXEL), boundary, holes, 1.4)
 
     def truth(points: FloatArray) -> FloatArray:
         return 0.8 * PITCH * np.array([1.0, 0.0]) - 0.01 * points

@@ -132,7 +132,7 @@ def test_an_interrupted_harvest_goes_on(harvested: Path, photographs: Path, tmp_
     assert np.array_equal(again.unknowns, first.unknowns)
 
 
-def test_damaged_and_foreign_frames_are_skipped_and_told(
+def test_damaged_and_foreign_frames_are_skipped_and_reported(
     photographs: Path, images: ImageSet, tmp_path: Path
 ) -> None:
     path = experiment(photographs, tmp_path)

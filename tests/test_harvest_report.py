@@ -1,7 +1,7 @@
 """The report of a harvest: whole, self-contained, right in its numbers, for every kind of test.
 
 Guards: nothing is loaded from elsewhere; every panel is there for every photograph; links and ids
-fit together; what is not known is left out and not made up; the outline follows the mask; numbers
+fit together; what is not known is left out and not made up; the boundary follows the mask; numbers
 in the summary are those of the measurement they stand for.
 """
 
@@ -132,12 +132,12 @@ def test_words_of_users_are_escaped_and_said(text: str) -> None:
 
 
 def test_what_is_not_known_is_left_out(harvest: Harvest, tmp_path: File) -> None:
-    told: list[float] = []
+    reported: list[float] = []
     unknown = bare(harvest)
     write_page(photographs_report(harvest_summary(unknown), unknown), tmp_path / "report.html",
-               lambda done, total, what: told.append(done / total))  # fmt: skip
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+               lambda done, total, what: reported.append(done / total))  # fmt: skip
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
     page = Page((tmp_path / "report.html").read_text("utf-8"))
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
     for panel in photograph_panels(states(harvest)):
@@ -182,13 +182,13 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
         "v2", "phi2", "fluc2x", "fluc2y", "v2-noise", "fluc2-noise"]  # fmt: skip
     drawn = second[0].draw(state)
     drawn.canvas.draw()
-    told = harvest_summary(both_modes)["frames"][0]
-    assert told["modes"][1]["waves"][0]["xi"] == pytest.approx([0.6, 0.2])
-    cards = mode_cards([told], {told["name"]: "it"})
+    reported = harvest_summary(both_modes)["frames"][0]
+    assert reported["modes"][1]["waves"][0]["xi"] == pytest.approx([0.6, 0.2])
+    cards = mode_cards([reported], {reported["name"]: "it"})
     assert [len(table.rows) for card in cards for table in card.tables] == [7, 4]
 
 
-def test_photographs_alike_are_told_apart_by_their_names(summary: dict[str, Any]) -> None:
+def test_photographs_alike_are_distinguished_by_their_names(summary: dict[str, Any]) -> None:
     first, second = summary["frames"]
     said = photograph_labels([first, second, second | {"name": "again"}])
     at = "After buckling · 7\N{NO-BREAK SPACE}%"
@@ -197,14 +197,14 @@ def test_photographs_alike_are_told_apart_by_their_names(summary: dict[str, Any]
 
 
 def test_advice_that_was_taken_is_not_given_again(harvest: Harvest) -> None:
-    held, free = harvest.frames[0], replace(harvest.frames[1], name="free")
+    fixed, free = harvest.frames[0], replace(harvest.frames[1], name="free")
     weak = free.result.ansatz.initial_guess(0.05, 0.01)
     result = replace(free.result, unknowns=weak)
     free = replace(free, result=result, identifiability=identifiability(result, made_up.MASK))
-    told = harvest_summary(replace(harvest, frames=(held, free)))["frames"]
-    assert held.identifiability.unobservable == free.identifiability.unobservable == (0,)
-    assert told[0]["warnings"] == []
-    assert "phi1 is not observable" in told[1]["warnings"][0]
+    reported = harvest_summary(replace(harvest, frames=(fixed, free)))["frames"]
+    assert fixed.identifiability.unobservable == free.identifiability.unobservable == (0,)
+    assert reported[0]["warnings"] == []
+    assert "phi1 is not observable" in reported[1]["warnings"][0]
 
 
 def test_many_photographs_have_numbers_and_some_have_pictures(harvest: Harvest) -> None:
@@ -229,14 +229,14 @@ def test_the_summary_is_plain_json(harvest: Harvest, summary: dict[str, Any]) ->
     lost = replace(unknown.frames[0].result, inverse=np.diag([np.inf] * 77))
     by_noise = replace(unknown.frames[0].by_noise, covariance=lost.inverse)
     frame = replace(unknown.frames[0], result=lost, by_noise=by_noise)
-    told = harvest_summary(replace(unknown, frames=(frame,)))
-    assert json.dumps(told, allow_nan=False)
-    assert told["frames"][0]["modes"][0]["parameters"][0]["sd_noise"] is None
+    reported = harvest_summary(replace(unknown, frames=(frame,)))
+    assert json.dumps(reported, allow_nan=False)
+    assert reported["frames"][0]["modes"][0]["parameters"][0]["sd_noise"] is None
 
 
 def test_the_summary_tells_the_measured_numbers(harvest: Harvest, summary: dict[str, Any]) -> None:
-    frame, told = harvest.frames[1], summary["frames"][1]
-    mode, result = told["modes"][0], frame.result
+    frame, reported = harvest.frames[1], summary["frames"][1]
+    mode, result = reported["modes"][0], frame.result
     part = result.ansatz.phi_slice(0)
     # v is a constant, phi's two waves are the diagonals, with a wavelength of two cells.
     assert mode["v_max_mm"] == pytest.approx(0.9)
@@ -249,10 +249,12 @@ def test_the_summary_tells_the_measured_numbers(harvest: Harvest, summary: dict[
     # w was made up: two waves of 4 um, of 0.32 px, on top of what was measured; as seen at the
     # local DIC's points, of which every sixth pixel has one.
     at = made_up.wave()[3::6, 3::6][made_up.MASK[3::6, 3::6]] / made_up.GRID.pixel_size
-    assert told["local"]["w_beyond_noise_px"] == pytest.approx(np.sqrt((at**2).mean()), rel=1e-2)
-    held = summary["frames"][0]["modes"][0]
-    assert held["fixed"]
-    assert held["waves"][0]["sd_noise"] is None
+    assert reported["local"]["w_beyond_noise_px"] == pytest.approx(
+        np.sqrt((at**2).mean()), rel=1e-2
+    )
+    fixed = summary["frames"][0]["modes"][0]
+    assert fixed["fixed"]
+    assert fixed["waves"][0]["sd_noise"] is None
     assert summary["lattice"]["pitch_px"] == pytest.approx(40.0, abs=0.1)
     assert summary["buckling"]["before"] == 0.04
 
@@ -261,18 +263,18 @@ def test_units_of_a_mode_of_another_length(harvest: Harvest) -> None:
     frame = harvest.frames[1]
     mode = replace(frame.result.ansatz.modes[0], half_wavelength=2 * made_up.PITCH)
     result = replace(frame.result, ansatz=replace(frame.result.ansatz, modes=(mode,)))
-    told = harvest_summary(replace(harvest, frames=(replace(frame, result=result),)))
+    reported = harvest_summary(replace(harvest, frames=(replace(frame, result=result),)))
     # The same k is a wave twice as long.
-    assert told["frames"][0]["modes"][0]["waves"][0]["xi"] == [0.25, 0.25]
+    assert reported["frames"][0]["modes"][0]["waves"][0]["xi"] == [0.25, 0.25]
 
 
-def test_the_outline_follows_the_mask() -> None:
-    outline = mask_boundary(made_up.MASK, made_up.GRID)
-    assert len(outline.loops) == 25  # the edge and 24 holes
-    areas = [_area(outline.nodes[loop[:, 0]]) for loop in outline.loops]
+def test_the_boundary_follows_the_mask() -> None:
+    boundary = mask_boundary(made_up.MASK, made_up.GRID)
+    assert len(boundary.loops) == 25  # the edge and 24 holes
+    areas = [_area(boundary.nodes[loop[:, 0]]) for loop in boundary.loops]
     edge = int(np.argmax(np.abs(areas)))
     assert abs(areas[edge]) == pytest.approx(2.3 * 3.3, rel=0.01)
-    # Holes run the other way round, so that they stay open when the outline is filled.
+    # Holes run the other way round, so that they stay open when the boundary is filled.
     holes = np.sign(-areas[edge]) * np.delete(areas, edge)
     # A circle of pixels has the circle's area within half a pixel along its edge.
     area = np.pi * made_up.DIAMETER**2 / 4
@@ -280,13 +282,13 @@ def test_the_outline_follows_the_mask() -> None:
     x, y = np.meshgrid(made_up.GRID.x, made_up.GRID.y)
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     inside = np.logical_xor.reduce(
-        [Path(outline.nodes[loop[:, 0]]).contains_points(points) for loop in outline.loops]
+        [Path(boundary.nodes[loop[:, 0]]).contains_points(points) for loop in boundary.loops]
     )
     # It runs between the pixels, at most a third of one off: they are told apart but for a few.
     assert np.mean(inside != made_up.MASK.ravel()) < 0.01
 
 
-def test_specks_and_an_empty_mask_have_no_outline() -> None:
+def test_specks_and_an_empty_mask_have_no_boundary() -> None:
     mask = np.zeros(made_up.GRID.shape, dtype=np.bool_)
     assert not mask_boundary(mask, made_up.GRID).loops
     mask[50:53, 50:53] = True
@@ -305,7 +307,7 @@ def test_an_affine_part_of_a_distortion_is_not_an_error() -> None:
     assert np.abs(apart_without_affine(found, made_up.lens(2.0), *at)).max() > 0.5
 
 
-def test_warnings_outcomes_and_the_noise_are_told(summary: dict[str, Any]) -> None:
+def test_warnings_outcomes_and_the_noise_are_reported(summary: dict[str, Any]) -> None:
     change = {"outcome": "stagnated", "outcome_why": "No step.", "warnings": ["beware of this"]}
     frame = summary["frames"][1] | change
     said = notes(summary | {"frames": [frame]})
@@ -325,7 +327,7 @@ def test_warnings_outcomes_and_the_noise_are_told(summary: dict[str, Any]) -> No
         ({"before": 0.04, "after": 0.05, "estimate": 0.045}, "4 … 5"),
     ],
 )
-def test_buckling_is_told_as_far_as_it_is_known(
+def test_buckling_is_reported_as_far_as_it_is_known(
     summary: dict[str, Any], buckling: dict[str, Any] | None, value: str | None
 ) -> None:
     keys = key_numbers(summary | {"buckling": buckling, "truth": []})

@@ -233,15 +233,15 @@ def test_a_family_with_fewer_parameters_takes_the_place_of_free_waves(
 
 
 @pytest.mark.usefixtures("unrendered_pictures")
-def test_where_every_correlation_is_trapped_the_refitted_ansatz_is_the_result(
+def test_where_every_correlation_is_in_a_local_minimum_the_refitted_ansatz_is_the_result(
     photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def trapped(*given: Any, **named: Any) -> Result:
+    def local_minimum(*given: Any, **named: Any) -> Result:
         right = correlate(*given, **named)
         return replace(right, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.9 * right.unknowns)
 
     for module in ("photograph.measure", "finite_element.result"):
-        monkeypatch.setattr(f"modeharvest.idic.{module}.correlate", trapped)
+        monkeypatch.setattr(f"modeharvest.idic.{module}.correlate", local_minimum)
     found = harvest(experiment(photographs), tmp_path, whole_field=True)
     for frame in found["frames"]:
         name = frame["name"]
@@ -255,7 +255,7 @@ def test_where_every_correlation_is_trapped_the_refitted_ansatz_is_the_result(
         assert rms_px(result.displacement() - refit.displacement(), SCENE.mask) < 1e-6
         true = truth(STATES[name])(SCENE.points)
         best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
-        # As after a correlation that isn't trapped.
+        # As after a correlation that ends in no local minimum.
         assert rms_px(result.displacement() - best.displacement(), SCENE.mask) < 0.02
         # w makes the residual what it is: 0.8 px beside speckles of 12 px.
         assert 0.5 < frame["model_error_px"] / (STATES[name] / 0.05 * W_PX / np.sqrt(2.0)) < 1.5

@@ -201,7 +201,7 @@ def bent_of(points: FloatArray, after: FloatArray, before: FloatArray) -> FloatA
     return np.asarray(after[nearest])
 
 
-def test_rivals_are_told_when_a_column_left_the_image() -> None:
+def test_rivals_are_reported_when_a_column_left_the_image() -> None:
     points = lattice_points(SQUARE, (6, 10))
     reference = lattice_of(holes_at(points))
     cut = lattice_of(holes_at(points[10:] - (0.0, 30.0)))

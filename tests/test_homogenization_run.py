@@ -353,9 +353,9 @@ def case_of(path: Path, text: str) -> HomogenizationCase:
 
 
 def main_exit(code: int) -> None:
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as outcome:
         main()
-    assert ended.value.code == code
+    assert outcome.value.code == code
 
 
 @pytest.mark.dolfinx
@@ -516,8 +516,8 @@ def test_three_measured_modes_are_snapped_each(tmp_path: Path) -> None:
     run = HomogenizationRun(case, tmp_path / "out")
     ansatz = Ansatz.of_specimen(case.experiment.specimen)
     object.__setattr__(run, "result", Modes(ansatz))
-    starts = [mode.family.start for mode in ansatz.modes]
-    off = np.concatenate(starts) + np.tile([0.01, 0.02, 0.03, -0.02, 0.05, -0.05], 3)
+    guesses = [mode.family.start for mode in ansatz.modes]
+    off = np.concatenate(guesses) + np.tile([0.01, 0.02, 0.03, -0.02, 0.05, -0.05], 3)
     modes = run._modes_of(off)
     assert [mode.wave_change.max() < 0.06 for mode in modes] == 3 * [True]
     points = np.random.default_rng(0).uniform(-5, 5, (20, 2))

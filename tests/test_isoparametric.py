@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ELEMENTS = ("T3", "T6", "Q4", "Q8", "Q9")
 ACCEPTED_PX = 1e-10  # the residual that truth files promise
-OUTLINE_PX = 0.02  # nearer to an outline than this, its polygon of chords can't tell
+BOUNDARY_PX = 0.02  # nearer to an boundary than this, its polygon of chords can't tell
 
 
 # Independent of the code under test: shape functions from the textbook -------------------------
@@ -57,7 +57,7 @@ def textbook(element: str, xi: FloatArray) -> FloatArray:
     return np.stack([line(p, s) * line(q, t) for p, q in order], axis=-1)
 
 
-def outline(element: str, nodes: FloatArray, per_side: int = 80) -> FloatArray:
+def boundary(element: str, nodes: FloatArray, per_side: int = 80) -> FloatArray:
     """(points, 2) the boundary of one element, counter-clockwise, as a fine polygon."""
     u = np.linspace(0, 1, per_side, endpoint=False)[:, None]
     count = 3 if element[0] == "T" else 4
@@ -137,7 +137,7 @@ def patch(n: int, seed: int, amplitude: float, element: str = "T6") -> tuple[Flo
     return limited(nodes, change, cells, element), cells
 
 
-def patch_outline(nodes: FloatArray, n: int, element: str = "T6") -> FloatArray:
+def patch_boundary(nodes: FloatArray, n: int, element: str = "T6") -> FloatArray:
     """Trace the boundary of a patch as a fine polygon, counter-clockwise."""
     number = np.arange((2 * n + 1) ** 2).reshape(2 * n + 1, 2 * n + 1)
     sides = [number[0], number[:, -1], number[-1, ::-1], number[::-1, 0]]
@@ -200,15 +200,15 @@ def test_shape_functions_are_the_textbook_ones(element: str) -> None:
 @pytest.mark.parametrize("element", ELEMENTS)
 @settings(deadline=None, derandomize=True, max_examples=25)
 @given(seed=st.integers(0, 10**6), amplitude=st.floats(0.02, 1.0))
-def test_an_element_owns_the_pixels_that_its_outline_encloses(
+def test_an_element_owns_the_pixels_that_its_boundary_encloses(
     element: str, seed: int, amplitude: float
 ) -> None:
     nodes, cells = single(element, seed, amplitude)
     grid = grid_over(nodes, 25)
     located = locate(nodes, cells, element, grid)
     assert_maps_back(located, nodes, cells, element, grid)
-    turns, distance = winding(outline(element, nodes), pixel_centres(grid))
-    clear = distance > OUTLINE_PX * grid.pixel_size
+    turns, distance = winding(boundary(element, nodes), pixel_centres(grid))
+    clear = distance > BOUNDARY_PX * grid.pixel_size
     np.testing.assert_array_equal(located.mask.ravel()[clear], turns[clear] > 0)
 
 
@@ -243,11 +243,11 @@ def test_every_pixel_of_a_patch_is_found_exactly_once(
     assert_maps_back(located, nodes, cells, element, grid)
     alone = [locate(nodes, cells[[e]], element, grid) for e in range(len(cells))]
     claims = np.array([a.mask for a in alone])
-    turns, distance = winding(patch_outline(nodes, n, element), pixel_centres(grid))
-    clear = distance > OUTLINE_PX * grid.pixel_size
+    turns, distance = winding(patch_boundary(nodes, n, element), pixel_centres(grid))
+    clear = distance > BOUNDARY_PX * grid.pixel_size
     covered = turns.reshape(grid.shape)
     # Each element alone claims what it claims in company, and no pixel is claimed more often
-    # than the outline goes round it; bulged edges of the outline may cross each other.
+    # than the boundary goes round it; bulged edges of the boundary may cross each other.
     np.testing.assert_array_equal(located.mask, claims.any(axis=0))
     np.testing.assert_array_equal(located.element[located.mask], claims.argmax(0)[located.mask])
     np.testing.assert_array_equal(claims.sum(axis=0).ravel()[clear], covered.ravel()[clear])

@@ -143,7 +143,7 @@ def test_the_tour_suits_the_lattice_and_its_load() -> None:
         ('[lattice]\nkind = "hexagonal"\n[study]', "expected a square lattice"),
     ],
 )
-def test_a_wrong_case_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_case_is_reported_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(InputError) as caught:
         LatticeCase.read(written(tmp_path, text))
     message = str(caught.value)

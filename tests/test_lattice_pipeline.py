@@ -311,7 +311,7 @@ def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(
         ("[lattice]\n[modes]\nwaves = [[0.0517, 1]]", "repeats within 12 cells"),
     ],
 )
-def test_bad_input_is_told_in_one_line(
+def test_bad_input_is_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,

@@ -157,13 +157,13 @@ def test_a_mode_is_no_equilibrium_and_a_small_pattern_is_magnified(tmp_path: Pat
     assert "stable; fluctuation × 7.5" in text
 
 
-def test_progress_is_told_up_to_the_end(tmp_path: Path) -> None:
-    told: list[float] = []
+def test_progress_is_reported_up_to_the_end(tmp_path: Path) -> None:
+    reported: list[float] = []
     run = made_up.run(study=None)
     report = lattice_report(summary_of(run, run.patterns), run)
-    write_page(report, tmp_path / "r.html", lambda done, total, what: told.append(done / total))
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    write_page(report, tmp_path / "r.html", lambda done, total, what: reported.append(done / total))
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
 
 
 @pytest.mark.parametrize(

@@ -212,7 +212,7 @@ def test_one_refinement_bounds_the_critical_load_s_error() -> None:
     assert load_error(found, path, TwoTermI1(), CriticalSearch(refine=False)) is None
 
 
-def test_a_refined_mesh_fills_the_same_curved_outline() -> None:
+def test_a_refined_mesh_fills_the_same_curved_boundary() -> None:
     finer = UnitCell(refined(SQUARE.mesh, 1e-7), SQUARE.lattice)
     assert len(finer.mesh.cells) == 4 * len(SQUARE.mesh.cells)
     masses = [PeriodicCell(cell, TwoTermI1()).nodal_mass.sum() for cell in (SQUARE, finer)]

@@ -110,9 +110,9 @@ def test_without_a_background_all_is_material_and_that_is_said() -> None:
     assert "whole image" in material.text[0]
 
 
-def test_background_like_the_speckle_is_told() -> None:
+def test_background_like_the_speckle_is_reported() -> None:
     said = find_material(image(0.5, 0.03, specimen())).text
-    assert any("grey levels of the background" in sentence for sentence in said)
+    assert any("grey levels of the background" in message for message in said)
 
 
 def test_bad_images_are_refused() -> None:

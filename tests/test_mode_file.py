@@ -141,11 +141,11 @@ def test_paraview_files_tell_the_rest_in_a_comment(
     modes, branches = sample()
     write(tmp_path / name, modes, branches)
     text = (tmp_path / name).read_text(encoding="utf-8")
-    told = json.loads(text.split("<!-- ")[1].split(" -->")[0])
-    assert told["info"] == modes.info  # the two hyphens, too, which no comment may have
-    assert told["load"] == modes.load
-    assert told["waves_rad"] == [list(wave) for wave in modes.waves]
-    assert told["branches"][0] == {"combination": [0.6, -0.8], "outcome": "followed"}
+    reported = json.loads(text.split("<!-- ")[1].split(" -->")[0])
+    assert reported["info"] == modes.info  # the two hyphens, too, which no comment may have
+    assert reported["load"] == modes.load
+    assert reported["waves_rad"] == [list(wave) for wave in modes.waves]
+    assert reported["branches"][0] == {"combination": [0.6, -0.8], "outcome": "followed"}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])

@@ -216,7 +216,7 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
     assert all(draw().axes for draw in found.figures.values())
 
 
-def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:
+def test_other_ends_are_reported_and_left_out(measured: tuple[Any, ...]) -> None:
     study, table, folder = measured
     odd = table.copy()
     odd["unstable_pivots"] = odd["unstable_pivots"].astype(float)
@@ -282,13 +282,13 @@ def test_the_shipped_study_spells_out_the_defaults() -> None:
         ({"largest": 0.7}, "largest between 0 and 0.5"),
     ],
 )
-def test_wrong_options_are_told_in_one_line(options: dict[str, Any], said: str) -> None:
+def test_wrong_options_are_reported_in_one_line(options: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
         MeasuredModesStudy(**options)
     assert "\n" not in str(caught.value)
 
 
-def test_a_base_that_has_not_buckled_is_told(subject: ImagePairSpec, tmp_path: Path) -> None:
+def test_a_base_that_has_not_buckled_is_reported(subject: ImagePairSpec, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"buckled at 7.8 %, got one with 9.6\d* % as its"):
         MeasuredModesStudy(strain=0.078).prepare(subject, tmp_path)
     tilted = replace(subject, experiment=replace(subject.experiment, tilt=0.01))
@@ -296,6 +296,6 @@ def test_a_base_that_has_not_buckled_is_told(subject: ImagePairSpec, tmp_path: P
         MeasuredModesStudy().prepare(tilted, tmp_path)
 
 
-def test_gradings_too_steep_are_told(subject: ImagePairSpec, tmp_path: Path) -> None:
+def test_gradings_too_steep_are_reported(subject: ImagePairSpec, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="make diameters or gradings smaller"):
         MeasuredModesStudy(gradings_x=(0.2,)).prepare(subject, tmp_path)

@@ -206,8 +206,8 @@ def test_the_docs_show_the_example_s_case_and_help_names_the_kind() -> None:
     page = (ROOT / "docs" / "lattices.md").read_text("utf-8")
     case = load(ROOT / "examples" / "own_cell.py").CASE
     assert case.strip() in page
-    told = subprocess.run(
+    reported = subprocess.run(
         [sys.executable, "-m", "modeharvest", "bloch", "--help"],
         capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "200"},
     ).stdout  # fmt: skip
-    assert 'kind = "file"' in told
+    assert 'kind = "file"' in reported

@@ -156,18 +156,18 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
     assert [path.read_bytes() for path in measured] == content
 
 
-def test_where_the_correlation_is_trapped_the_refitted_unknowns_are_the_result(
+def test_where_the_correlation_is_in_a_local_minimum_the_refitted_unknowns_are_the_result(
     case: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """And they are the trapped one's again where the whole displacement is left out."""
+    """And they are those of the local minimum again where the whole displacement is left out."""
 
-    def trapped(*given: Any, **named: Any) -> Result:
+    def local_minimum(*given: Any, **named: Any) -> Result:
         right = correlate(*given, **named)
         off = right.ansatz.initial_guess(0.0, 1.0)
         return replace(right, outcome=Outcome.LOCAL_MINIMUM, unknowns=right.unknowns + 0.2 * off)
 
     for module in ("runs.experiment", "idic.finite_element.result"):
-        monkeypatch.setattr(f"modeharvest.{module}.correlate", trapped)
+        monkeypatch.setattr(f"modeharvest.{module}.correlate", local_minimum)
     monkeypatch.setattr(whole_field, "get_num_threads", lambda: 1)
     shutil.rmtree(folder / "correlation")
     where = case, "--out", folder
@@ -311,7 +311,7 @@ def test_an_interrupted_run_continues_to_the_same_end(
         ("stages.json", "cut", "validate"),
     ],
 )
-def test_a_damaged_file_is_told_and_what_is_advised_mends_it(
+def test_a_damaged_file_is_reported_and_what_is_advised_mends_it(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     case: Path,
@@ -402,7 +402,7 @@ def test_a_solution_of_the_same_experiment_is_taken(case: Path, folder: Path) ->
 
 
 @pytest.mark.usefixtures("unrendered_pictures")
-def test_strain_beyond_what_converges_is_told_and_the_rest_is_kept(
+def test_strain_beyond_what_converges_is_reported_and_the_rest_is_kept(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     case = tmp_path / "far.toml"

@@ -88,7 +88,7 @@ def test_a_periodic_displacement_repeats_in_every_copy() -> None:
     np.testing.assert_allclose(patch.moved(modes.shapes[0]), expected, atol=1e-12)
 
 
-def test_the_cell_s_outline_follows_the_mean_deformation() -> None:
+def test_the_cell_s_boundary_follows_the_mean_deformation() -> None:
     mesh, lattice = made_up.cell()
     patch = LatticePatch.of(mesh, lattice, (3 * L, 3 * L))
     F = np.array([[0.9, 0.1], [0.0, 1.05]])
@@ -152,8 +152,8 @@ def test_the_zone_map_is_drawn_in_cartesian_wave_vectors(lattice: NDArray[np.flo
 def test_the_hexagonal_zone_has_six_corners_and_its_critical_waves_six_images() -> None:
     m_points = ((math.pi, 0.0), (0.0, math.pi), (math.pi, math.pi))
     drawn = draw_zone_map(made_up.zone(0.06, HEXAGONAL), L, m_points)
-    outline = drawn.axes[0].patches[0]
-    corners = np.unique(np.round(outline.get_xy(), 9), axis=0)  # type: ignore[attr-defined]
+    edge = drawn.axes[0].patches[0]
+    corners = np.unique(np.round(edge.get_xy(), 9), axis=0)  # type: ignore[attr-defined]
     # Corners at 2/3, middles of the edges at 1/sqrt 3 from Γ [1/l].
     np.testing.assert_allclose(np.linalg.norm(corners, axis=1), 2 / 3)
     assert len(corners) == 6

@@ -72,16 +72,16 @@ class Child:
     """Stands for a child that compiles for ever."""
 
     def __init__(self, command: list[str], **_: Any) -> None:
-        self.command, self.ended = command, False
+        self.command, self.finished = command, False
 
     def poll(self) -> int | None:
-        return -9 if self.ended else None
+        return -9 if self.finished else None
 
     def kill(self) -> None:
-        self.ended = True
+        self.finished = True
 
     def wait(self) -> int:
-        assert self.ended
+        assert self.finished
         return -9
 
 
@@ -108,7 +108,7 @@ def test_only_what_is_missing_is_compiled_and_no_child_is_left(children: list[Ch
     with precompiling(("image", "correlate")) as kernels:
         kernels.wait("correlate")  # at once: nobody compiles it
         assert [child.command[-1] for child in children] == ["image"]
-    assert children[0].ended
+    assert children[0].finished
 
 
 def test_what_is_measured_with_is_compiled_after_what_it_calls(children: list[Child]) -> None:
@@ -121,7 +121,7 @@ def test_what_is_measured_with_is_compiled_after_what_it_calls(children: list[Ch
         assert child.command[-2:] == ["correlate", "measure"]
         there.touch()
         kernels.wait("correlate")  # no longer than that, though the child goes on
-        assert not child.ended
+        assert not child.finished
 
 
 def test_ranks_of_mpirun_start_no_children(

@@ -34,9 +34,9 @@ def loaded_by(*names: str) -> set[str]:
 
 @pytest.mark.dolfinx
 @pytest.mark.parametrize("name", [name for name in mh.__all__ if name != "__version__"])
-def test_every_name_is_its_home_s_own(name: str) -> None:
-    home = importlib.import_module(f"modeharvest.{mh._HOMES[name]}")
-    assert getattr(mh, name) is getattr(home, name)
+def test_every_name_is_its_module_s_own(name: str) -> None:
+    own_module = importlib.import_module(f"modeharvest.{mh._HOMES[name]}")
+    assert getattr(mh, name) is getattr(own_module, name)
     assert name in dir(mh)
 
 

@@ -32,7 +32,7 @@ def test_an_image_against_the_pulled_back_one_gives_the_whole_displacement() -> 
     assert error_px(again, truth) < 1e-4
 
 
-def test_pixels_off_the_image_are_told() -> None:
+def test_pixels_off_the_image_are_reported() -> None:
     ansatz, truth, f, g = case()
     result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth)
     shifted = ansatz.initial_guess()

@@ -75,7 +75,7 @@ def test_edges_outside_the_image_are_named() -> None:
     assert "leaves the image at the left, right" in region.text[-1]
 
 
-def test_a_region_that_is_no_rectangle_is_told() -> None:
+def test_a_region_that_is_no_rectangle_is_reported() -> None:
     triangle = [(60.0, 60.0), (60.0, 340.0), (190.0, 60.0)]
     region = region_of_polygon(triangle, specimen_mask(), GRID)
     assert re.search(r"fills 5[01] % of its bounding box", region.text[1])  # rounding of px

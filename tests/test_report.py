@@ -163,12 +163,12 @@ def test_a_correlation_without_a_mode_has_no_panels_of_it(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("unrendered_pictures")
-def test_progress_is_told_up_to_the_end() -> None:
-    told: list[float] = []
+def test_progress_is_reported_up_to_the_end() -> None:
+    reported: list[float] = []
     figures = experiment_figures(made_up.data((0.05,)))
-    draw_figures(figures, lambda done, total, what: told.append(done / total))
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    draw_figures(figures, lambda done, total, what: reported.append(done / total))
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
 
 
 def test_what_is_drawn_before_the_numbers_is_what_the_page_shows(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_chi_squared_is_noise_and_what_noise_free_images_leave(
     assert "The residual was weighed with" in snapshot["weighting"]
 
 
-def test_gain_and_offset_are_told_where_they_were_unknown(exposed: Run) -> None:
+def test_gain_and_offset_are_reported_where_they_were_unknown(exposed: Run) -> None:
     (snapshot,) = read_json(exposed.folder / "summary.json")["snapshots"]
     assert 0.9 < snapshot["gain_min"] < snapshot["gain_max"] < 1.1
     assert snapshot["offset_min"] == snapshot["offset_max"]  # of degree 0
@@ -109,10 +109,10 @@ def test_what_standard_errors_mean_depends_on_the_images() -> None:
     assert "noise-free averages" in note(noisy, about)
 
 
-def test_a_held_mode_has_no_parameters_off_the_ideal() -> None:
-    held = summary(mode=[], mode_deviation_percent=[])
-    assert "Fixed at the ideal pattern" in note(held, "no pattern is observable")
-    assert not any("nan" in said for said in notes(held))
-    (key,) = (k for k in key_numbers(held) if k.name == "deviation of the mode")
+def test_a_fixed_mode_has_no_parameters_off_the_ideal() -> None:
+    fixed = summary(mode=[], mode_deviation_percent=[])
+    assert "Fixed at the ideal pattern" in note(fixed, "no pattern is observable")
+    assert not any("nan" in said for said in notes(fixed))
+    (key,) = (k for k in key_numbers(fixed) if k.name == "deviation of the mode")
     assert (key.value, key.remark) == (None, "fixed at the ideal pattern")
     assert "% off the ideal" in note(summary(), "no pattern is observable")

@@ -155,8 +155,8 @@ def test_a_star_by_command(
     assert "8 images of 31 x 100 px" in said
     assert StarSet.read(tmp_path / "s").spec.noise == (0.01, 0.03)
     assert run("--rows", "30") == 2
-    told = capsys.readouterr().err
-    assert "odd number of rows" in " ".join(told.split())
+    predicted = capsys.readouterr().err
+    assert "odd number of rows" in " ".join(predicted.split())
 
 
 def test_a_star_set_can_be_made_again_and_tells_all(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_grading_finds_the_period_of_a_known_filter(width: int, step: int) -> No
     assert found.challenge_px == pytest.approx(expected, rel=0.05)
 
 
-def test_errors_of_resolution_and_noise_are_as_large_as_told() -> None:
+def test_errors_of_resolution_and_noise_are_as_large_as_predicted() -> None:
     """Twenty realisations of white noise through a filter: chi squared of both, 99.9 %."""
     star = Star(rows=121, cols=1200, shortest_px=10.0, longest_px=100.0)
     width, noise = 9, 0.05
@@ -215,8 +215,8 @@ def test_errors_of_resolution_and_noise_are_as_large_as_told() -> None:
     assert 5.9 < np.sum(np.square(z)) < 45.3
     n = np.array([floor.v_px for floor in floors])
     assert n.mean() == pytest.approx(noise / width, rel=0.02)  # white noise over w^2 px
-    told = np.mean([floor.v_se_px for floor in floors])
-    assert told == pytest.approx(n.std(ddof=1), rel=0.6)
+    predicted = np.mean([floor.v_se_px for floor in floors])
+    assert predicted == pytest.approx(n.std(ddof=1), rel=0.6)
 
 
 def test_the_indicator_hardly_depends_on_the_size_of_the_subset(tmp_path: Path) -> None:

@@ -209,7 +209,7 @@ def test_findings_of_a_resolution_study(
     assert len(found.figures) == 4
     assert all(draw().axes for draw in found.figures.values())
     assert len(found.text) == 7
-    assert not any("nan" in sentence for sentence in found.text)
+    assert not any("nan" in words for words in found.text)
 
 
 @pytest.mark.parametrize(

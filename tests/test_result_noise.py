@@ -100,9 +100,9 @@ def test_noise_in_the_gradient_is_taken_back(sd: float) -> None:
     _, d_row, d_col = SplineImage.of(pair()[1]).sample(*np.nonzero(MASK))
     expected = noisy.noise_transfer.slope * sd**2 / (0.5 * (d_row**2 + d_col**2).mean())
     assert gained == pytest.approx(expected, rel=0.1)
-    told = np.trace(np.linalg.solve(clean, noisy.covariance(sd))) / ANSATZ.size
+    predicted = np.trace(np.linalg.solve(clean, noisy.covariance(sd))) / ANSATZ.size
     # 1/det F; and 3 %, because x and y differ in where between pixels they land.
-    assert told == pytest.approx(1 + 0.5 * gained, rel=0.03)
+    assert predicted == pytest.approx(1 + 0.5 * gained, rel=0.03)
 
 
 def test_a_residual_that_is_noise_tells_as_much() -> None:

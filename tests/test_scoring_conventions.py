@@ -144,7 +144,7 @@ NAMED = {
 
 
 @pytest.mark.parametrize("words", NAMED)
-def test_one_mistake_is_named(words: str) -> None:
+def test_one_wrong_convention_is_named(words: str) -> None:
     truth = true_motion(1.0)
     field = declared(NAMED[words].write(*measured(truth, NOISE_PX)), down=True, in_mm=False)
     meant, (said,) = check_conventions(field, truth, GRID)
@@ -170,7 +170,7 @@ def smooth(length_px: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("size", [1.0, 0.1, 0.02])
-def test_errors_of_other_kinds_are_no_mistakes(size: float) -> None:
+def test_errors_of_other_kinds_are_no_wrong_conventions(size: float) -> None:
     """Noise, bias, too large a strain, turned frames, outliers, smooth errors: of any size."""
     truth = true_motion(size)
     x, y, u = measured(truth, 0.01)
@@ -188,7 +188,7 @@ def test_errors_of_other_kinds_are_no_mistakes(size: float) -> None:
         assert check_conventions(field, truth, GRID)[1] == ()
 
 
-def test_a_shift_is_not_told_from_a_bias_where_strain_is_the_same_everywhere() -> None:
+def test_a_shift_is_not_reported_from_a_bias_where_strain_is_the_same_everywhere() -> None:
     """Nobody can: 1 px off in position is 0.05 px off in displacement, at every point."""
 
     def truth(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -196,7 +196,9 @@ def test_a_file_that_is_no_field_is_named(truth: BenchmarkTruth, tmp_path: Path)
         ({"columns": ["w=c"]}, "x, y, u, v, sd_u, sd_v, sigma, valid, got 'w'"),
     ],
 )
-def test_declarations_that_do_not_fit_are_told(options: dict[str, list[str]], words: str) -> None:
+def test_declarations_that_do_not_fit_are_reported(
+    options: dict[str, list[str]], words: str
+) -> None:
     with pytest.raises(InputError, match=words):
         declarations([Path("a.csv"), Path("b.csv")], **options)  # type: ignore[arg-type]
 

@@ -87,13 +87,15 @@ def test_bad_values_are_named(values: dict[str, float], words: str) -> None:
         SquareLatticeOptions(**values)  # type: ignore[arg-type]
 
 
-def test_a_held_mode_has_no_unknowns_and_is_the_ideal_one() -> None:
+def test_a_fixed_mode_has_no_unknowns_and_is_the_ideal_one() -> None:
     specimen = Specimen(holes_x=5, holes_y=4)
-    free, held = (SquareLatticeOptions(fixed_mode=h).ansatz(specimen) for h in (False, True))
-    assert held.size == free.size - 7
+    free, fixed = (SquareLatticeOptions(fixed_mode=h).ansatz(specimen) for h in (False, True))
+    assert fixed.size == free.size - 7
     x, y = np.linspace(-5, 5, 7), np.linspace(-4, 4, 9)
     np.testing.assert_allclose(
-        held.phi(0, held.initial_guess(), x, y), free.phi(0, free.initial_guess(), x, y), atol=1e-15
+        fixed.phi(0, fixed.initial_guess(), x, y),
+        free.phi(0, free.initial_guess(), x, y),
+        atol=1e-15,
     )
 
 

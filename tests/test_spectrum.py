@@ -202,7 +202,7 @@ def test_equivalent_modes_are_the_same_field(mode, sign):
 
 @SETTINGS
 @given(st.booleans(), st.booleans(), st.booleans(), st.booleans(), st.integers(-2, 2))
-def test_every_equivalent_of_the_reference_comes_home(swap, both, turn1, turn2, turns):
+def test_every_equivalent_of_the_reference_is_it(swap, both, turn1, turn2, turns):
     a, k1, k2, c1, c2, sign = 1.0, np.array([1.0, 1]), np.array([-1.0, 1]), 0.0, 0.0, 1
     if swap:
         a, k1, k2, sign = -1.0, k2, k1, -1
@@ -212,8 +212,8 @@ def test_every_equivalent_of_the_reference_comes_home(swap, both, turn1, turn2, 
         k1, c1 = -k1, PITCH - c1
     if turn2:
         k2, c2 = -k2, PITCH - c2
-    home, turned = mode_equivalent([a, *k1, *k2, c1 + 2 * PITCH * turns, c2], PITCH)
-    np.testing.assert_allclose(home, REFERENCE_MODE, atol=1e-12)
+    reference, turned = mode_equivalent([a, *k1, *k2, c1 + 2 * PITCH * turns, c2], PITCH)
+    np.testing.assert_allclose(reference, REFERENCE_MODE, atol=1e-12)
     assert turned == sign
 
 

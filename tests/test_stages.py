@@ -176,7 +176,7 @@ with exclusive(sys.stdin.readline().strip()):
 
 
 @contextmanager
-def held_elsewhere(folder: Path) -> Iterator[subprocess.Popen[str]]:
+def locked_elsewhere(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """Another process that has the folder."""
     pipe = subprocess.PIPE
     other = subprocess.Popen([sys.executable, "-c", HOLDS], stdin=pipe, stdout=pipe, text=True)
@@ -190,8 +190,8 @@ def held_elsewhere(folder: Path) -> Iterator[subprocess.Popen[str]]:
         other.communicate()
 
 
-def test_a_held_folder_is_refused_with_its_holder_and_free_afterwards(tmp_path: Path) -> None:
-    with held_elsewhere(tmp_path) as other:
+def test_a_fixed_folder_is_refused_with_its_holder_and_free_afterwards(tmp_path: Path) -> None:
+    with locked_elsewhere(tmp_path) as other:
         with pytest.raises(InputError) as error, exclusive(tmp_path):
             pass
         said = f"process {other.pid} on {socket.gethostname()}, since 20"
@@ -206,7 +206,7 @@ def test_a_held_folder_is_refused_with_its_holder_and_free_afterwards(tmp_path: 
 
 
 def test_the_system_gives_the_folder_back_when_its_holder_is_killed(tmp_path: Path) -> None:
-    with held_elsewhere(tmp_path) as other:
+    with locked_elsewhere(tmp_path) as other:
         other.send_signal(signal.SIGKILL)
         other.wait()
         assert (tmp_path / ".lock").exists()
@@ -247,10 +247,10 @@ def test_without_locks_in_the_file_system_the_file_decides(
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    ended = subprocess.Popen([sys.executable, "-S", "-c", ""])
-    ended.wait()
+    is_over = subprocess.Popen([sys.executable, "-S", "-c", ""])
+    is_over.wait()
     holder = {
-        "process": os.getpid() if process == "own" else ended.pid,
+        "process": os.getpid() if process == "own" else is_over.pid,
         "host": socket.gethostname() if host == "here" else "far.example.org",
     }
     (tmp_path / ".lock").write_text(json.dumps(holder))
@@ -286,7 +286,7 @@ def test_where_nothing_can_be_written_nothing_is_locked(
 def occupied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder that another process has."""
     folder = tmp_path_factory.mktemp("occupied") / "out"
-    with held_elsewhere(folder):
+    with locked_elsewhere(folder):
         yield folder
 
 
@@ -353,5 +353,5 @@ def test_under_mpirun_one_rank_holds_for_all_and_all_are_refused(tmp_path: Path)
         return done.stdout.count(word)
 
     assert counted("had it") == 2
-    with held_elsewhere(tmp_path):
+    with locked_elsewhere(tmp_path):
         assert counted("refused") == 2

@@ -71,7 +71,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("studies")
 
 
-def starts_table(distances: list[float], outcomes: list[str] | None = None) -> pd.DataFrame:
+def guesses_table(distances: list[float], outcomes: list[str] | None = None) -> pd.DataFrame:
     """A table as a robustness study of one radius leaves it."""
     n = len(distances)
     return pd.DataFrame({
@@ -99,7 +99,7 @@ def test_intervals_are_wilson_s(good: int, n: int) -> None:
 
 
 def test_numbers_of_a_robustness_study() -> None:
-    table = starts_table([1e-9] * 97 + [0.5, 2.0, 4.0])
+    table = guesses_table([1e-9] * 97 + [0.5, 2.0, 4.0])
     table.loc[98, "outcome"] = "local_minimum"
     table.loc[99, ["error", "outcome"]] = ["MemoryError: too large", None]
     table.loc[99, ["distance_px", "epsilon_percent"]] = np.nan
@@ -122,7 +122,7 @@ def test_numbers_of_a_robustness_study() -> None:
 def test_the_basin_ends_where_the_first_start_is_lost() -> None:
     parts = []
     for radius, lost in ((0.05, 0), (0.1, 0), (0.2, 1), (0.3, 0), (0.5, 3)):
-        part = starts_table([9.0] * lost + [1e-9] * (4 - lost), ["local_minimum"] * lost
+        part = guesses_table([9.0] * lost + [1e-9] * (4 - lost), ["local_minimum"] * lost
                             + ["converged"] * (4 - lost))  # fmt: skip
         parts.append(part.assign(radius=radius))
     table = pd.concat(parts, ignore_index=True)
@@ -146,12 +146,12 @@ def test_one_start_against_a_calculation_of_its_own(subject: ImagePairSpec, fold
     near, far = study.prepare(subject, folder)
     found = one_start(near, folder)
     scene = VirtualImagePair.open(folder, near["images"])
-    home = scene.correlate()
+    nominal = scene.correlate()
     start = scene.initial_guess()
     unit = np.random.default_rng([0, 0]).uniform(-1.0, 1.0, 7)
     start[scene.ansatz.phi_slice(0)] += 0.1 * unit * np.array([1] * 5 + [1.9] * 2)
     end = scene.correlate(start)
-    u, other = (r.displacement()[::4, ::4][scene.mask[::4, ::4]] / 0.05 for r in (home, end))
+    u, other = (r.displacement()[::4, ::4][scene.mask[::4, ::4]] / 0.05 for r in (nominal, end))
     norm, other_norm = np.linalg.norm(u), np.linalg.norm(other)
     epsilon = 100.0 * abs(norm - other_norm) / norm
     assert found["epsilon_percent"] == pytest.approx(epsilon, rel=1e-6, abs=1e-12)
@@ -345,7 +345,7 @@ def test_a_quick_study_is_smaller() -> None:
         ("[experiment]", "expected a table [study]"),
     ],
 )
-def test_a_wrong_study_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_study_is_reported_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "study.toml"
     path.write_text(text, "utf-8")
     with pytest.raises(InputError) as caught:
@@ -354,7 +354,7 @@ def test_a_wrong_study_is_told_in_one_line(tmp_path: Path, text: str, said: str)
     assert "\n" not in str(caught.value)
 
 
-def test_levels_out_of_range_are_told_before_anything_runs(
+def test_levels_out_of_range_are_reported_before_anything_runs(
     subject: ImagePairSpec, folder: Path
 ) -> None:
     for name, level, said in (
@@ -441,7 +441,7 @@ def test_a_case_has_one_thread(tmp_path: Path) -> None:
         numba.set_num_threads(before)
 
 
-def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder in which one of two starts failed, and none is left to be run."""
     assert PAPER is not None
     case = StudyCase(study=RobustnessStudy(initial_guesses=2, radii=(), strain_errors=()))
@@ -449,7 +449,7 @@ def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     pipeline = StudyAnalysis(case, tmp_path, solution=PAPER)
     cases = case.study.prepare(pipeline.pair_spec(), tmp_path)
     plan = Campaign(case.study.function, cases, tmp_path)
-    result = starts_table([1e-9]).iloc[0].drop(list(cases[0]), errors="ignore").to_dict()
+    result = guesses_table([1e-9]).iloc[0].drop(list(cases[0]), errors="ignore").to_dict()
     traceback = "Traceback …\nMemoryError: too large"
     for one, error in zip(cases, ("", traceback), strict=True):
         store(plan.path(one), one, None if error else result, error)
@@ -458,7 +458,7 @@ def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     (failure,) = summary["failed"]
     assert failure == {"file": plan.path(cases[1]).name, "error": "MemoryError: too large"}
     assert "1 of 2 cases failed" in (tmp_path / "report.html").read_text()
-    monkeypatch.setattr(Campaign, "table", lambda self: starts_table([1.0]).assign(error="No"))
+    monkeypatch.setattr(Campaign, "table", lambda self: guesses_table([1.0]).assign(error="No"))
     with pytest.raises(InputError, match="all 1 cases failed; the first: No"):
         pipeline.all()
 
@@ -473,7 +473,7 @@ def check_page(text: str, summary: dict[str, Any]) -> None:
     assert not {"script", "link", "iframe"} & set(seen.tags)
     assert {"distances", "epsilon", "basin"} <= set(seen.ids)
     assert "A &lt;tiny&gt; study" in text
-    made = re.findall(r'<p class="fact">(.*?)</p>', text)
+    made = re.findall(r'<p class="numbers">(.*?)</p>', text)
     assert len(made) == 3
     assert all("modeharvest study" in m and "seed 0" in m for m in made)
     assert text.index("2 of 2 initial guesses") < text.index('id="figures"')  # sentences first
@@ -495,7 +495,7 @@ def check_page(text: str, summary: dict[str, Any]) -> None:
         (("nowhere.toml",), "expected a case file at nowhere.toml"),
     ],
 )
-def test_a_wrong_command_is_told_in_one_line(
+def test_a_wrong_command_is_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,

@@ -75,7 +75,7 @@ def test_what_pyvale_writes_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert field.source == "pyvale, subsets of 21 px"
 
 
-def test_a_failure_of_pyvale_is_told_in_a_line(
+def test_a_failure_of_pyvale_is_reported_in_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(WHERE, str(stand_in(tmp_path, "", code=1)))
@@ -83,7 +83,7 @@ def test_a_failure_of_pyvale_is_told_in_a_line(
         subset_field(ImagePair(*pair(), GRID, MASK))
 
 
-def test_without_pyvale_the_way_to_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyvale_the_way_to_it_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(WHERE, "/nowhere/python")
     with pytest.raises(MissingDependencyError, match="found no file /nowhere/python"):
         pyvale_python()

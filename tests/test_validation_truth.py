@@ -66,15 +66,15 @@ def test_the_best_fit_is_the_lowest_minimum_though_it_is_looked_for_on_few_pixel
     monkeypatch.setattr(correlation, "_ENOUGH", 800)  # every third pixel or so
     ansatz, mask = one_mode(), body()
     near = ansatz.initial_guess(0.05, 1.0)
-    trapped = near.copy()
-    trapped[ansatz.phi_slice(0)][1:3] *= 2.5  # wave vectors that lead to another minimum
+    far = near.copy()
+    far[ansatz.phi_slice(0)][1:3] *= 2.5  # wave vectors that lead to another minimum
     truth = ansatz.displacement(near, GRID.x, GRID.y) + beyond_the_ansatz()
     truth = np.where(mask[..., None], truth, np.nan)
-    on_all = [fit_displacement(truth, GRID, ansatz, a, mask) for a in (near, trapped)]
+    on_all = [fit_displacement(truth, GRID, ansatz, a, mask) for a in (near, far)]
     assert on_all[1].residual_rms > 1.1 * on_all[0].residual_rms
-    starts = (trapped, near) if flip else (near, trapped)
-    begun = replace(on_all[0], unknowns=starts[0])
-    found = best_fit(Truth.of(displacement=truth), begun, guesses=starts[1:])
+    initial = (far, near) if flip else (near, far)
+    begun = replace(on_all[0], unknowns=initial[0])
+    found = best_fit(Truth.of(displacement=truth), begun, guesses=initial[1:])
     assert found.pixels == on_all[0].pixels
     assert found.residual_rms <= on_all[0].residual_rms
     # as near as the coarser tolerance of the other, 1e-4 px
@@ -155,29 +155,29 @@ def ring(n: int = 16) -> Mesh:
     return Mesh(nodes, np.array(cells), "Q8")
 
 
-def area_of(outline: MeshBoundary, displacement: NDArray[np.float64] | None = None) -> float:
+def area_of(boundary: MeshBoundary, displacement: NDArray[np.float64] | None = None) -> float:
     """Sum up the signed area inside the path; holes count negative."""
     zoom = 1e4  # curves are flattened to a fraction of a unit
     total = 0.0
-    for loop in outline.path(displacement).to_polygons(Affine2D().scale(zoom), closed_only=True):
+    for loop in boundary.path(displacement).to_polygons(Affine2D().scale(zoom), closed_only=True):
         x, y = loop[:-1].T
         total += 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
     return total / zoom**2
 
 
-def test_outline_finds_edge_and_hole_and_keeps_them_curved() -> None:
-    outline = MeshBoundary.of(ring())
-    assert sorted(len(loop) for loop in outline.loops) == [16, 16]
+def test_boundary_finds_edge_and_hole_and_keeps_them_curved() -> None:
+    boundary = MeshBoundary.of(ring())
+    assert sorted(len(loop) for loop in boundary.loops) == [16, 16]
     # Parabolas through three points each, pi/16 apart, miss a circle's area by (pi/16)^4 / 30 or
     # so, 5e-5; straight chords would miss 6e-3.
-    assert area_of(outline) == pytest.approx(3 * np.pi, rel=2e-4)
+    assert area_of(boundary) == pytest.approx(3 * np.pi, rel=2e-4)
 
 
-def test_outline_moves_with_the_nodes() -> None:
+def test_boundary_moves_with_the_nodes() -> None:
     mesh = ring()
-    outline = MeshBoundary.of(mesh)
-    moved = outline.path(np.full_like(mesh.nodes, 5.0)).get_extents()
+    boundary = MeshBoundary.of(mesh)
+    moved = boundary.path(np.full_like(mesh.nodes, 5.0)).get_extents()
     np.testing.assert_allclose([moved.x0, moved.x1], [3.0, 7.0], atol=0.01)
-    assert area_of(outline, mesh.nodes) == pytest.approx(
-        4 * area_of(outline), rel=1e-4
+    assert area_of(boundary, mesh.nodes) == pytest.approx(
+        4 * area_of(boundary), rel=1e-4
     )  # of flattening

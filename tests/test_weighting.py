@@ -230,8 +230,11 @@ def test_what_is_of_second_order_in_the_noise_is_small() -> None:
 
 def test_results_tell_the_errors_they_have() -> None:
     _, bounds, results = monte_carlo(FINEST)
-    told = np.array([r.covariance(NOISE) for r in results])
-    share = np.trace(np.linalg.solve(np.repeat(bounds, 2, axis=0), told).mean(axis=0)) / ANSATZ.size
+    predicted = np.array([r.covariance(NOISE) for r in results])
+    share = (
+        np.trace(np.linalg.solve(np.repeat(bounds, 2, axis=0), predicted).mean(axis=0))
+        / ANSATZ.size
+    )
     # 2 % is what the blur costs.
     assert share == pytest.approx(1.01, abs=0.02)
 
@@ -428,7 +431,7 @@ def test_pixels_at_the_border_do_not_keep_a_correlation_from_settling() -> None:
         assert found.weighting.gradient is Gradient.REFERENCE
 
 
-def test_a_root_that_is_not_found_is_told() -> None:
+def test_a_root_that_is_not_found_is_predicted() -> None:
     """Weights that have nothing to do with the images lead nowhere."""
     f, g = pair()
     used = Assembly(ANSATZ, GRID, MASK)

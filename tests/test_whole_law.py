@@ -87,7 +87,7 @@ def test_a_law_that_does_not_fit_is_noticed() -> None:
         pair, np.zeros_like,
         options=FiniteElementOptions(30.0, 15.0, law=options.law, cutoff_px=400.0),
     )  # fmt: skip
-    assert any("law doesn't fit" in sentence for sentence in forced.warnings)
+    assert any("law doesn't fit" in message for message in forced.warnings)
     assert forced.contradicted is not None
     assert forced.contradicted > 0.2
     assert forced.grid == GRID

@@ -169,7 +169,7 @@ def test_mesh_of_a_part_is_refused() -> None:
         measure_displacement(pair, at_rest, corner)
 
 
-def test_starts_that_are_no_displacement() -> None:
+def test_begins_that_are_no_displacement() -> None:
     pair = plate_pair(quadratic_field)
     with pytest.raises(InputError, match="expected a start"):
         measure_displacement(pair, lambda x: x[:, 0], options=COARSE)

@@ -7,7 +7,7 @@ import pytest
 from plate_with_hole import GRID, HALF_SIZE, RADIUS, is_material
 
 from modeharvest.fem.field import Mesh, boundary_sides
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, outlines, quadratic
+from modeharvest.idic.finite_element.mesh import boundaries, mesh_of_mask, meshable, quadratic
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.util.errors import InputError
 
@@ -16,7 +16,7 @@ pytest.importorskip("gmsh")
 PLATE = is_material(np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1))
 
 
-def test_outline_to_sub_pixel() -> None:
+def test_boundary_to_sub_pixel() -> None:
     mesh = mesh_of_mask(PLATE, GRID, 20.0, 10.0).mesh
     edge = mesh.nodes[np.unique(boundary_sides(mesh))]
     radius = np.hypot(*edge.T)
@@ -51,7 +51,7 @@ def test_islands_are_bodies_and_specks_are_left_out() -> None:
     mask[50:70, 50:70] = False  # a hole of the first
     mask[10:14, 200:204] = True  # a speck
     mask[150:154, 160:164] = False  # dirt
-    assert sorted(len(part) for part in outlines(mask, 12.0)) == [1, 2]
+    assert sorted(len(part) for part in boundaries(mask, 12.0)) == [1, 2]
     kept, changes = meshable(mask, 12.0)
     assert [text.split(" ")[0] for text in changes] == ["Holes", "1"]
     assert "16 px at row 10, column 200" in changes[1]
@@ -73,7 +73,7 @@ def test_narrow_material_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("width", [2, 4, 5, 8])
-def test_slits_have_outlines_that_do_not_cross(width: int) -> None:
+def test_slits_have_boundaries_that_do_not_cross(width: int) -> None:
     mask = np.ones(GRID.shape, dtype=bool)
     mask[60:160, 100 : 100 + width] = False
     mesh = mesh_of_mask(mask, GRID, 24.0, 12.0).mesh

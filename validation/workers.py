@@ -202,7 +202,7 @@ def _environment_kept() -> Iterator[None]:
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
+def _interrupts_deferred() -> Iterator[None]:
     """Processes begun in here never hear Ctrl-C, which is for this one; it hears it afterwards."""
     if not _FORKS:
         yield
@@ -224,7 +224,7 @@ def _processes(count: int, memory: str) -> Iterator[Any]:
     with ExitStack() as stack:
         stack.enter_context(_environment_kept())
         stack.enter_context(dask.config.set(LOCAL))
-        with _interrupts_held():
+        with _interrupts_deferred():
             cluster = _begun(
                 LocalCluster,
                 n_workers=count,

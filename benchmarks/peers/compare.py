@@ -99,7 +99,7 @@ def _measure(section: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _report(record: Record, names: list[str], *, write: bool) -> None:
-    tables = {"run": record.sentences()}
+    tables = {"run": record.texts()}
     for section, module in SECTIONS.items():
         measured = {n: record.rows[n] for n in module.rows(not write) if n in record.rows}
         tables[section] = module.table(measured)

@@ -23,7 +23,7 @@ from modeharvest.idic.setup import CorrelationOptions
 
 FloatArray = NDArray[np.float64]
 
-FREE, HELD = "modeharvest, mode free", "modeharvest, mode given"
+FREE, GIVEN = "modeharvest, mode free", "modeharvest, mode given"
 WAYS = {
     "dense": "pyxel, basis per pixel (dense)",
     "sparse": "pyxel, basis per pixel (sparse)",
@@ -64,12 +64,12 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
     else:
         pair, name = paper(options["shape"], options["pixel_size"]), "paper's specimen"
     ways = _Ways(pair)
-    own = {FREE: ways.free, HELD: ways.held}
+    own = {FREE: ways.free, GIVEN: ways.mode_given}
     peers = {label: ways.pyxel(way) for way, label in WAYS.items()}
     found: dict[str, Any] = {}
     for label, lap in in_turn(own | peers, options["laps"], warm_up=own).items():
         best = ways.best_free if label == FREE else ways.best
-        found[label] = ways.judged(lap.result, best) | {"first_s": lap.first_s}
+        found[label] = ways.assessed(lap.result, best) | {"first_s": lap.first_s}
         if label in own:
             found[label] |= {"seconds": lap.median_s, "setup_s": 0.0}
     return {
@@ -102,7 +102,7 @@ class _Ways:
         """Ours, all 77 unknowns."""
         return self._ours(self.pair.ansatz, self.pair.start)
 
-    def held(self) -> Result:
+    def mode_given(self) -> Result:
         """Ours, with the unknowns that pyxel has."""
         return self._ours(*self.pair.fixed())
 
@@ -120,11 +120,11 @@ class _Ways:
 
         return run
 
-    def judged(self, found: Any, best: FloatArray) -> dict[str, Any]:
+    def assessed(self, found: Any, best: FloatArray) -> dict[str, Any]:
         """What to say of a result."""
         if isinstance(found, Result):
             displacement = found.displacement()
-            judged: dict[str, Any] = {
+            assessed: dict[str, Any] = {
                 "unknowns": int(np.isfinite(np.diag(found.inverse)).sum()),
                 "iterations": [sum(h.factor == k for h in found.history) for k in (8, 4, 2, 1)],
                 "outcome": found.outcome.value,
@@ -132,27 +132,27 @@ class _Ways:
         else:
             displacement = found.displacement
             full = max(found.iterations) >= pyxel_side.MAX_ITERATIONS
-            judged = {
+            assessed = {
                 "unknowns": self.pair.ansatz.phi_offset(0),
                 "iterations": list(found.iterations),
                 "outcome": "max_iterations" if full else "converged",
                 "seconds": statistics.median(self.seconds[found.way]),
                 "setup_s": found.setup_s,
             }
-        judged["error_px"] = self.pair.error_px(displacement)
-        judged["from_best_px"] = self.pair.error_px(displacement, best)
-        return judged
+        assessed["error_px"] = self.pair.error_px(displacement)
+        assessed["from_best_px"] = self.pair.error_px(displacement, best)
+        return assessed
 
 
 def _patterns(options: dict[str, Any]) -> dict[str, Any]:
     """Errors over several speckle patterns, and what quantisation alone predicts."""
-    found: dict[str, list[dict[str, Any]]] = {FREE: [], HELD: [], WAYS["dense"]: []}
+    found: dict[str, list[dict[str, Any]]] = {FREE: [], GIVEN: [], WAYS["dense"]: []}
     for seed in range(options["seeds"]):
         pair = inside_the_ansatz(options["shape"], 100 + seed)
         ways = _Ways(pair)
-        for name, way in zip(found, (ways.free, ways.held, ways.pyxel("dense")), strict=True):
+        for name, way in zip(found, (ways.free, ways.mode_given, ways.pyxel("dense")), strict=True):
             result = way()
-            one = ways.judged(result, pair.truth)
+            one = ways.assessed(result, pair.truth)
             if isinstance(result, Result):
                 one["predicted_px"] = _predicted_px(pair, result)
             found[name].append(one)
@@ -161,7 +161,7 @@ def _patterns(options: dict[str, Any]) -> dict[str, Any]:
         "pixels": int(pair.mask.sum()),
         "patterns": options["seeds"],
         "found": {name: _together(each) for name, each in found.items()},
-        "ratios": _ratios(found[HELD], found[WAYS["dense"]]),
+        "ratios": _ratios(found[GIVEN], found[WAYS["dense"]]),
     }
 
 
@@ -202,7 +202,7 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
     for row in found.values():
         if "images" not in row:
             continue
-        ours = row["found"][HELD]["seconds"]
+        ours = row["found"][GIVEN]["seconds"]
         for name, one in row["found"].items():
             iterations = " ".join(str(n) for n in one["iterations"])
             if one["outcome"] != "converged":
@@ -232,7 +232,7 @@ def _pattern_lines(row: dict[str, Any] | None) -> list[str]:
     ]
     for name, one in row["found"].items():
         # Whoever has the same unknowns has the same bound.
-        bound = one["predicted_px"] or row["found"][HELD]["predicted_px"]
+        bound = one["predicted_px"] or row["found"][GIVEN]["predicted_px"]
         if one["error_px"] is None:
             lines.append(f"| {name} | 0 | – | – | – |")
             continue

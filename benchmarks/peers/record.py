@@ -79,7 +79,7 @@ class Record:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         write_json(self.path, {"run": self.run, "rows": self.rows})
 
-    def sentences(self) -> list[str]:
+    def texts(self) -> list[str]:
         """Say in Markdown when, where and with what the rows were measured."""
         if not self.rows:
             return ["Nothing has been measured yet."]

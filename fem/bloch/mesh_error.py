@@ -1,7 +1,7 @@
 """How good a cell's mesh is: elements across its ligaments, and the error of a critical load.
 
 That error is estimated from the same point on a mesh refined once, every element divided into four
-along its own curved coordinates. Of the outline, which stays as it is, nothing is learnt so.
+along its own curved coordinates. Of the boundary, which stays as it is, nothing is learnt so.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from modeharvest.fem.lattice.cells import UnitCell
 from modeharvest.fem.lattice.foreign import NODES
 from modeharvest.fem.lattice.options import CriticalSearch
 from modeharvest.fem.lattice.periodicity import PARTS
-from modeharvest.fem.lattice.symmetry import Outline
+from modeharvest.fem.lattice.symmetry import HoleEdges
 from modeharvest.fem.materials import Material
 from modeharvest.fem.meshing import MeshBlock, join
 from modeharvest.util.arrays import FloatArray
@@ -41,7 +41,7 @@ def load_error(
     if not (found.found and search.refine):
         return None
     cell = path.cell.cell
-    order = NOTCHED if Outline(cell.mesh, cell.periodicity).sharpest > _NOTCH else SMOOTH
+    order = NOTCHED if HoleEdges(cell.mesh, cell.periodicity).sharpest > _NOTCH else SMOOTH
     shortest = float(np.linalg.norm(cell.lattice, axis=1).min())
     finer = UnitCell(refined(cell.mesh, 1e-7 * shortest), cell.lattice)
     nested = CellPath(PeriodicCell(finer, material), path.loading)
@@ -79,12 +79,12 @@ def elements_across(cell: UnitCell) -> tuple[int, FloatArray]:
     From each hole on layers of elements are counted; holes meet where a side joins two nodes that
     are nearer to different ones. A hole's own arms, around a ligament that ends, are not looked at.
     """
-    p, outline = cell.periodicity, Outline(cell.mesh, cell.periodicity)
+    p, edges = cell.periodicity, HoleEdges(cell.mesh, cell.periodicity)
     sides = np.concatenate([cell.mesh.cells[:, [k, (k + 1) % 3]] for k in range(3)])
     sides = np.concatenate([sides, sides[:, ::-1]])
     (a, b), step = p.master[sides].T, p.shift[sides[:, 1]] - p.shift[sides[:, 0]]
     hole, copy = np.full(p.count, -1), np.zeros((p.count, 2), dtype=np.int64)
-    hole[outline.masters], copy[outline.masters] = outline.hole, outline.copy
+    hole[edges.masters], copy[edges.masters] = edges.hole, edges.copy
     layer = np.where(hole < 0, -1, 0)
     while True:
         reached = np.flatnonzero((layer[a] == layer.max()) & (layer[b] < 0))
@@ -93,7 +93,7 @@ def elements_across(cell: UnitCell) -> tuple[int, FloatArray]:
         hole[b[reached]], copy[b[reached]] = hole[a[reached]], copy[a[reached]] - step[reached]
         layer[b[reached]] = layer.max() + 1
     meet = np.flatnonzero((hole[a] != hole[b]) | np.any(copy[a] - step != copy[b], axis=1))
-    if not (len(outline.areas) and len(meet)):
+    if not (len(edges.areas) and len(meet)):
         return len(cell.mesh.cells), cell.mesh.nodes[0]
     across = layer[a[meet]] + layer[b[meet]] + 1
     least = int(np.argmin(across))

@@ -105,11 +105,11 @@ class CondensedCell:
         solved = -factor.solve(np.column_stack(known))
         self.negative = factor.negative_pivots
         if C is not None:
-            solved, held = solved[:, : -len(C)], solved[:, -len(C) :]
-            size = C @ held  # negative definite where the constrained tangent is as K
+            solved, by_constraints = solved[:, : -len(C)], solved[:, -len(C) :]
+            size = C @ by_constraints  # negative definite where the constrained tangent is as K
             missing = C @ solved
             missing[:, 0] += self._violation
-            solved = solved - held @ np.linalg.solve(size, missing)
+            solved = solved - by_constraints @ np.linalg.solve(size, missing)
             self.negative += int(np.sum(np.linalg.eigvalsh(0.5 * (size + size.T)) < 0)) - len(C)
         self.relaxed, self.response = cell.every(solved[:, 0]), cell.every(solved[:, 1:])
         self.condensed = carriers.T @ self.on_carriers + coupling.T @ solved[:, 1:]

@@ -183,7 +183,7 @@ def chiral(
 
 @dataclass(frozen=True)
 class _RingAndLigaments:
-    """What the outline is made of [mm].
+    """What the boundary is made of [mm].
 
     In the ligament's own frame the ring is about the origin and the ligament runs along x
     between y = ring_radius - ligament_thickness and y = ring_radius, up to its middle.

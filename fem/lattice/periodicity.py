@@ -23,7 +23,7 @@ from modeharvest.util.errors import InputError
 
 SAME_PLACE = 1e-6
 """Of the shorter lattice vector: nodes that near to each other, copies moved, are the same."""
-# Neighbours that can touch a cell whose outline reaches no further than two cells.
+# Neighbours that can touch a cell whose boundary reaches no further than two cells.
 _NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
 
 

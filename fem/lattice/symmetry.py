@@ -54,25 +54,25 @@ class CellSymmetry:
 def find_symmetry(mesh: Mesh, periodicity: Periodicity) -> CellSymmetry:
     """The symmetries of the lattice that a cell makes up."""
     lattice, nowhere = periodicity.lattice, np.zeros((1, 2))
-    outline = Outline(mesh, periodicity)
-    if not len(outline.areas):
+    edges = HoleEdges(mesh, periodicity)
+    if not len(edges.areas):
         return CellSymmetry(lattice, nowhere)
-    moves = [move for move in outline.candidates(np.eye(2)) if outline.has(np.eye(2), move)]
+    moves = [move for move in edges.candidates(np.eye(2)) if edges.has(np.eye(2), move)]
     count = max(len(moves), 1)
     turns = np.rint(count * np.array(moves or nowhere) @ np.linalg.inv(lattice)) / count
     translations = np.unique(np.mod(turns, 1.0), axis=0) @ lattice
-    if len(translations) != count or len(outline.areas) % count:  # no group: by chance alike
+    if len(translations) != count or len(edges.areas) % count:  # no group: by chance alike
         count, translations = 1, nowhere
     reduced = _reduced(translations, lattice, count)
     operations = []
     for turn in _turns(reduced):
-        move = next((m for m in outline.candidates(turn) if outline.has(turn, m)), None)
+        move = next((m for m in edges.candidates(turn) if edges.has(turn, m)), None)
         if move is not None and not np.allclose(turn, np.eye(2)):
             operations.append(Symmetry(turn, move))
     return CellSymmetry(lattice if count == 1 else reduced, translations, tuple(operations))
 
 
-class Outline:
+class HoleEdges:
     """The edges of a lattice's holes: area (negative) and centroid [mm] of each.
 
     The corners on them are the nodes ``masters`` (s,), which lie on number ``hole`` (s,) in the

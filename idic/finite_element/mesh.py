@@ -1,6 +1,6 @@
 """A T6 mesh of the material: from a mask alone, or from a mesh that is given.
 
-The outline of a mask is the contour at one half of the mask blurred by 1.5 px, smoothed along
+The boundary of a mask is the contour at one half of the mask blurred by 1.5 px, smoothed along
 itself, with its corners put back: within some 0.2 px of a smooth edge, holes included.
 """
 
@@ -39,11 +39,11 @@ _NARROWEST_PX = 3.0
 """Material between two holes that can still be meshed."""
 
 _SECONDS, _SECONDS_PER_ELEMENT = 60.0, 2e-3
-"""That gmsh may take: many times what it takes where no outlines cross."""
+"""That gmsh may take: many times what it takes where no boundaries cross."""
 _LEAST_ISLAND, _LEAST_HOLE = 4.0, 0.25
 """Areas of what is meshed, over the square of an element's edge [-]."""
 _MARGIN = 1.1
-"""That a mask's pixels have over the smoothed outline around them, at most."""
+"""That a mask's pixels have over the smoothed boundary around them, at most."""
 _OPENINGS_PX = (2.0, 3.0, 4.0)
 """Radii of disks that fit on what is left, tried in turn where material is too narrow."""
 _ISLANDS_NAMED = 3
@@ -143,7 +143,7 @@ def mesh_of_mask(
             f"expected material at least {_NARROWEST_PX:g} px wide between holes, got {edge:.1f} "
             "px; take images of more pixels, or fill the holes in the mask"
         )
-    parts = outlines(kept, edge)
+    parts = boundaries(kept, edge)
     if not parts:
         raise InputError(
             f"expected a mask with material for elements of {element_px:g} px, got "
@@ -172,7 +172,7 @@ def _meshed_in_child(
         failed, got = True, f"none in {seconds:.0f} s"
     if failed:
         raise InputError(
-            f"expected a mesh within the mask's outlines from gmsh, got {got}; smooth the mask, "
+            f"expected a mesh within the mask's boundaries from gmsh, got {got}; smooth the mask, "
             "fill its narrow holes, or give a mesh"
         )
     nodes, cells = pickle.loads(done.stdout)
@@ -218,8 +218,8 @@ def _twice_area(nodes: FloatArray, cells: IntArray) -> FloatArray:
     return np.asarray(d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0])
 
 
-def outlines(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
-    """Find the outlines of a mask, of each island, for elements of so many px.
+def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
+    """Find the boundaries of a mask, of each island, for elements of so many px.
 
     Islands and holes too small for such elements are left out; :func:`meshable` says which.
     """

@@ -1,4 +1,4 @@
-"""Motion before any correlation: from hole centres, outlines or optical flow, by robust fits.
+"""Motion before any correlation: from hole centres, boundaries or optical flow, by robust fits.
 
 Optical flow: the deformed image is warped back by what is known already (a slow field through
 hole centres, say), and the remaining optical flow is found on binned and blurred images by
@@ -111,21 +111,21 @@ def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tupl
     """Find the slow motion from what the images' geometry shows, and a sentence about it.
 
     From the displacements of the holes' centres, by polynomials over the domain [mm], or from the
-    outlines in the masks.
+    boundaries in the masks.
     """
     found = None if holes is None else _through_holes(domain, holes)
     if found is not None:
         return found
     plane = None
     if pair.mask is not None and pair.deformed_mask is not None:
-        plane = outline_motion(pair.mask, pair.deformed_mask, pair.grid)
+        plane = edge_motion(pair.mask, pair.deformed_mask, pair.grid)
     if plane is None:
         return (
             np.zeros_like,
-            "v0 starts from no motion: neither holes nor whole outlines are known.",
+            "v0 starts from no motion: neither holes nor whole boundaries are known.",
         )
     return partial(_affine, plane), (
-        f"v0 starts from the outlines: {100 * plane[0, 1]:+.1f} % along x and "
+        f"v0 starts from the boundaries: {100 * plane[0, 1]:+.1f} % along x and "
         f"{100 * plane[1, 2]:+.1f} % along y."
     )
 
@@ -150,11 +150,11 @@ def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
     )
 
 
-def outline_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -> FloatArray | None:
-    """Affine motion that takes one outline to the other, by centre and second moments.
+def edge_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -> FloatArray | None:
+    """Affine motion that takes one boundary to the other, by centre and second moments.
 
     (2, 3) u_i = affine[i] · (1, x, y) [mm], [-], [-]; None if material reaches the image's border,
-    where an outline is unknown. The holes are filled, so that it doesn't matter how they close. A
+    where a boundary is unknown. The holes are filled, so that it doesn't matter how they close. A
     rotation or a shear isn't observable in these moments and is taken to be none.
     """
     moments = []

@@ -5,7 +5,7 @@ Modes": a displacement field, its spectral densities, the waves that they show, 
 these belong to. The field is a local DIC's where there is one, and otherwise a rough one that the
 images give by themselves.
 
-1. v0: through the motion of hole centres, or of outlines; not needed with a local DIC's field.
+1. v0: through the motion of hole centres, or of boundaries; not needed with a local DIC's field.
 2. A field, rough or measured, and its spectrum over each region.
 3. Modes: the square family with seven parameters, or free waves, or the pattern that the lattice of
    holes allows, fixed, where the images show none.

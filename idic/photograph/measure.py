@@ -180,13 +180,13 @@ def measure_whole(
     if found.outcome not in ASTRAY:
         start, known, a = "the result of its correlation", found.ansatz, found.unknowns
         gain, offset = known.gain_and_offset(a, pair.grid.x, pair.grid.y)
-        lit = replace(pair, reference=((pair.reference - offset) / gain).astype(np.float32))
+        normalised = replace(pair, reference=((pair.reference - offset) / gain).astype(np.float32))
         begin = known.displacement_at(a, mesh.nodes)
     else:
-        start, lit = "blocks of the speckle", pair
+        start, normalised = "blocks of the speckle", pair
         slow, _ = first_motion(geometry.region.domain, pair, first.local)
         begin = block_motion(pair, body, slow(mesh.nodes))
-    measured = displacement_from(begin, lit, body, on_mesh, progress)
+    measured = displacement_from(begin, normalised, body, on_mesh, progress)
     noise = image_noise(pair, camera)
     expected = float(np.hypot(noise.reference, noise.deformed))
     misfit = misfit_of(measured, expected, pair.reference[pair.masks[0]])

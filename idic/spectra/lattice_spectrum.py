@@ -172,7 +172,7 @@ def lattice_spectrum(
     nothing but a translation; if the mesh is larger than the cell; if pitch or reach aren't
     positive.
 
-    mesh : One cell of the lattice, of any outline that tiles the plane [mm].
+    mesh : One cell of the lattice, of any boundary that tiles the plane [mm].
     lattice : (2, 2) lattice vectors as rows [mm]; they need not be at right angles.
     values : (n, 2) field at the nodes, periodic: the affine part is already removed [mm].
     pitch : l [mm], which makes the wave vectors dimensionless.

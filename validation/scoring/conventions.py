@@ -132,14 +132,14 @@ def check_conventions(
         return DECLARED, ()
     before, after = (sample.median_px(reading) for reading in (DECLARED, meant))
     text = " and ".join(meant.text)
-    explained = f"the median error of {before:.3g} px would be {after:.3g} px if {text}"
+    gain = f"the median error of {before:.3g} px would be {after:.3g} px if {text}"
     if meant.scale != 1.0:
         raise InputError(
             f"{field.source}: expected displacements in the declared unit, got "
-            f"{1 / meant.scale:.4g} times the true ones; {explained} (a pixel is "
+            f"{1 / meant.scale:.4g} times the true ones; {gain} (a pixel is "
             f"{grid.pixel_size} mm); declare what the file holds"
         )
-    return meant, (f"{field.source}: {explained}; check what the file holds",)
+    return meant, (f"{field.source}: {gain}; check what the file holds",)
 
 
 def _orientations(grid: PixelGrid) -> list[Reading]:

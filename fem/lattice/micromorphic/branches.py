@@ -75,20 +75,20 @@ def homogenize(
     block, pending = "all", list(wanted)
     ranked: list[tuple[tuple[float, ...], HomogenizedState]] = []
 
-    def ended(outcome: str) -> Homogenized:
+    def result(outcome: str) -> Homogenized:
         return Homogenized(
             tuple(met), tuple(criticals), outcome, path.linearisations, tuple(ranked)
         )
 
     while pending:
         if not path.follow_primary(pending[0], block):
-            return ended(f"no equilibrium of the primary path beyond {path.states[-1].load:.6g}")
+            return result(f"no equilibrium of the primary path beyond {path.states[-1].load:.6g}")
         here = path.states[-1]
         progress(here.load, wanted[-1], "primary path")
         if is_unstable(here, block):
             found = path.critical(block)
             if found is None:
-                return ended(f"the critical point below the load {here.load:.6g} got lost")
+                return result(f"the critical point below the load {here.load:.6g} got lost")
             criticals.append(found)
             if found.kind == "pattern":
                 if len(found.modes) > 1:
@@ -96,13 +96,13 @@ def homogenize(
                 pattern = ranked[0][0] if ranked else None
                 states, outcome = follow_branch(path, found, pending, pattern, progress)
                 met += states
-                return ended(outcome)
+                return result(outcome)
             block = "pattern" if found.kind == "displacement" else ""
             continue
         if here.load >= pending[0] - 1e-12:
             met.append(here)
             pending.pop(0)
-    return ended(f"followed to the load {met[-1].load:.6g}")
+    return result(f"followed to the load {met[-1].load:.6g}")
 
 
 def follow_branch(

@@ -186,26 +186,26 @@ class HomogenizedBody:
         plates, sides = left | right, bottom | top
         x, y = ((nodes - low) / half - 1.0).T
         x = np.where(plates, 1.0 * right - left, x)
-        held, direction = np.zeros((2, n, 2 + self.mode_count))
+        fixed, direction = np.zeros((2, n, 2 + self.mode_count))
         if loading.quarter:
-            held[left, 0] = held[bottom, 1] = True
+            fixed[left, 0] = fixed[bottom, 1] = True
             plates, x = right, 0.5 * (x + 1.0)
         elif loading.plates == "sliding" and loading.sides in ("free", "periodic"):
             edge = np.flatnonzero(left)
-            held[edge[np.argmin(np.abs(y[edge]))], 1] = True
+            fixed[edge[np.argmin(np.abs(y[edge]))], 1] = True
         push = 0.5 * self.length * x
         direction[:, 0] = -push * (loading.compression + loading.bending * y)
         direction[:, 1] = push * loading.shear - loading.lateral * half[1] * y
-        held[plates, 0] = True
-        held[plates & (loading.plates == "clamped"), 1] = True
-        held[sides & (loading.sides in ("guided", "clamped")), 1] = True
+        fixed[plates, 0] = True
+        fixed[plates & (loading.plates == "clamped"), 1] = True
+        fixed[sides & (loading.sides in ("guided", "clamped")), 1] = True
         if loading.sides == "clamped":
-            held[sides, 0], plates = True, plates | sides
-        held[plates & (loading.pattern_at_plates == "zero"), 2:] = True
-        held[np.setdiff1d(np.arange(n), self._lattice_nodes), 2:] = True
+            fixed[sides, 0], plates = True, plates | sides
+        fixed[plates & (loading.pattern_at_plates == "zero"), 2:] = True
+        fixed[np.setdiff1d(np.arange(n), self._lattice_nodes), 2:] = True
         if loading.pattern_at_bulk == "zero":
-            held[np.unique(self.mesh.cells[~self.is_lattice]), 2:] = True
-        self._eliminate(held != 0.0, direction, self._followed(bottom, top, near))
+            fixed[np.unique(self.mesh.cells[~self.is_lattice]), 2:] = True
+        self._eliminate(fixed != 0.0, direction, self._followed(bottom, top, near))
 
     def _followed(self, bottom: BoolArray, top: BoolArray, near: float) -> IntArray:
         """(n,) the node whose fields each node's follow: itself, or its periodic partner."""
@@ -219,24 +219,24 @@ class HomogenizedBody:
             followed[upper] = lower
         return followed
 
-    def _eliminate(self, held: BoolArray, direction: FloatArray, followed: IntArray) -> None:
+    def _eliminate(self, fixed: BoolArray, direction: FloatArray, followed: IntArray) -> None:
         """Number the free unknowns; an InputError if a rigid motion is among them."""
-        is_free = ~held & (followed == np.arange(len(held)))[:, None]
-        numbers = np.where(is_free, np.cumsum(is_free).reshape(held.shape) - 1, -1)
-        place = np.where(held, -1, numbers[followed]).ravel()
+        is_free = ~fixed & (followed == np.arange(len(fixed)))[:, None]
+        numbers = np.where(is_free, np.cumsum(is_free).reshape(fixed.shape) - 1, -1)
+        place = np.where(fixed, -1, numbers[followed]).ravel()
         offset = direction - direction[followed]
         self.direction: FloatArray = np.where(place < 0, direction.ravel(), offset.ravel())
         """(size,) derivatives of all unknowns by the load, y fixed."""
         self.free_count, rows = int(is_free.sum()), np.flatnonzero(place >= 0)
-        shape = held.size, self.free_count
+        shape = fixed.size, self.free_count
         self.T = csr_array((np.ones(len(rows)), (rows, place[rows])), shape)
         """(size, free_count): all unknowns are T y + load * direction."""
-        self.is_pattern: BoolArray = np.broadcast_to(np.arange(held.shape[1]) > 1, held.shape)[
+        self.is_pattern: BoolArray = np.broadcast_to(np.arange(fixed.shape[1]) > 1, fixed.shape)[
             is_free
         ]
         """(free_count,) which of y are amplitudes v."""
         X = self.mesh.nodes - self.mesh.nodes.mean(axis=0)
-        rigid = np.zeros((*held.shape, 3))
+        rigid = np.zeros((*fixed.shape, 3))
         rigid[:, 0, 0] = rigid[:, 1, 1] = np.ptp(X)
         rigid[:, :2, 2] = np.stack([-X[:, 1], X[:, 0]], axis=1)
         flat = rigid.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Options of homogenization: how a homogenized specimen is held, loaded and divided."""
+"""Options of homogenization: how a homogenized specimen is supported, loaded and divided."""
 
 from __future__ import annotations
 

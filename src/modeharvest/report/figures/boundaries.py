@@ -1,4 +1,4 @@
-"""Outlines to draw: of a mesh, of a mask, of a piece of an infinite lattice."""
+"""Boundaries to draw: of a mesh, of a mask, of a piece of an infinite lattice."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ class HomogenizationCase(CaseModel):
 
     @property
     def plates(self) -> PlateLoading:
-        """How the homogenized specimen is held and loaded."""
+        """How the homogenized specimen is supported and loaded."""
         load = self.loading or SpecimenLoading(plates=self.experiment.edges)
         how = picked(self.homogenization, "pattern_at_plates pattern_at_bulk")
         rates = picked(load, "compression shear bending lateral plates sides")

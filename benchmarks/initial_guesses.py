@@ -1,15 +1,15 @@
-"""A map of starts: how far off the mode's parameters may be for a correlation to arrive.
+"""A map of initial guesses: how far off the mode's parameters may be for a correlation to arrive.
 
 The paper's case after buckling (12.8 %), noise-free images at its resolution. All seven
 parameters of the mode are put off the ideal at once: a1 ... a5 by up to a share of 1, the two
 phases by up to that share of the unit cell; at random within the box, and at random corners of
 it. v0 starts with the applied strain, v1 with the constant, as always. An end is *the same* as
-that of the standard start if the displacements are less than 0.01 px rms apart.
+that of the standard guess if the displacements are less than 0.01 px rms apart.
 
-The images are made once, in out/starts; so is a file of what was found, and a run goes on where
-it was stopped. Remove that file (starts-....json) after a change of the solver.
+The images are made once, in out/initial_guesses; so is a file of what was found, and a run goes on
+where it was stopped. Remove that file (initial_guesses-....json) after a change of the solver.
 
-Run: scripts/env python benchmarks/starts.py [--quick] [--count 16] [--picture FILE]
+Run: scripts/env python benchmarks/initial_guesses.py [--quick] [--count 16] [--picture FILE]
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from modeharvest.util.files import atomic, read_json, write_json
 
 FloatArray = NDArray[np.float64]
 
-FOLDER = Path("out/starts")
+FOLDER = Path("out/initial_guesses")
 STRAIN = 0.128
 RADII = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 SAME_PX = 0.01
@@ -47,7 +47,7 @@ QUICK_PIXEL = 0.04
 
 @dataclass(frozen=True)
 class End:
-    """Where a start led.
+    """Where an initial guess led.
 
     Parameters
     ----------
@@ -56,9 +56,9 @@ class End:
     corner
         Off by that much in all parameters, or by a random part of it.
     distance_px
-        From the standard start's end, rms length [px].
+        From the standard guess's end, rms length [px].
     start_distance_px
-        The start's own distance from there [px].
+        The guess's own distance from there [px].
     outcome
         Why the iteration ended.
     iterations, all_iterations
@@ -81,12 +81,12 @@ class End:
 
     @property
     def is_same(self) -> bool:
-        """Whether it is the standard start's minimum."""
+        """Whether it is the standard guess's minimum."""
         return self.distance_px < SAME_PX
 
 
 class Map:
-    """The images of the paper's case, and correlations of them from many starts."""
+    """The images of the paper's case, and correlations of them from many initial guesses."""
 
     def __init__(self, pixel_size: float) -> None:
         case, path = Case(), shipped_solution("paper-virtual")
@@ -107,7 +107,7 @@ class Map:
                 images.deformed_mask(STRAIN))  # fmt: skip
 
     def correlate(self, start: FloatArray) -> Result:
-        """Correlate as the case says, from another start."""
+        """Correlate as the case says, from another initial guess."""
         f, g, mask, deformed_mask = self._input
         options = self.how.options()
         return correlate(
@@ -144,11 +144,11 @@ def wanted(count: int) -> Iterator[tuple[float, bool, int]]:
 
 
 def explore(pixel_size: float, count: int, record: Path) -> list[End]:
-    """Correlate from every start that is not on record yet."""
+    """Correlate from every initial guess that is not on record yet."""
     done: dict[str, Any] = read_json(record) if record.is_file() else {}
     where = Map(pixel_size)
-    home = where.correlate(where.standard)
-    at_home = where.field(home.unknowns)
+    nominal = where.correlate(where.standard)
+    at_nominal = where.field(nominal.unknowns)
     ends = []
     for radius, corner, seed in wanted(count):
         key = f"{radius:g} {seed}"
@@ -159,8 +159,8 @@ def explore(pixel_size: float, count: int, record: Path) -> list[End]:
             end = End(
                 radius=radius,
                 corner=corner,
-                distance_px=where.apart(where.field(found.unknowns), at_home),
-                start_distance_px=where.apart(where.field(start), at_home),
+                distance_px=where.apart(where.field(found.unknowns), at_nominal),
+                start_distance_px=where.apart(where.field(start), at_nominal),
                 outcome=found.outcome.value,
                 iterations=found.iterations,
                 all_iterations=len(found.history),
@@ -177,9 +177,10 @@ def explore(pixel_size: float, count: int, record: Path) -> list[End]:
 
 def tell(ends: list[End]) -> None:
     """Print the table."""
-    print("| off by | starts | distance of the start, largest [px] | same end: inside, corners | "
-          "trapped, said so | other end, called converged | iterations on the full image | "
-          "largest distance among the same [px] |\n|---|---|---|---|---|---|---|---|")  # fmt: skip
+    print("| off by | initial guesses | distance of the guess, largest [px] | same end: inside, "
+          "corners | local minimum, recognised | other end, called converged | iterations on the "
+          "full image | largest distance among the same [px] |\n"
+          "|---|---|---|---|---|---|---|---|")  # fmt: skip
     for radius in RADII:
         at = [e for e in ends if e.radius == radius]
         same = [e for e in at if e.is_same]
@@ -212,12 +213,12 @@ def draw(ends: list[End], path: Path) -> None:
 
     inside, corners = ([e for e in ends if e.corner is corner] for corner in (False, True))
     axes.plot(percent, shares(inside, lambda e: e.is_same), "o-", color=BLUE,
-              label="same minimum, starts within the box")  # fmt: skip
+              label="same minimum, initial guesses within the box")  # fmt: skip
     axes.plot(percent, shares(corners, lambda e: e.is_same), "s-", color=GREEN,
               label="same minimum, corners of the box")  # fmt: skip
     unnoticed = shares(ends, lambda e: not e.is_same and e.outcome == "converged")
     axes.plot(percent, unnoticed, "x--", color=RED, label="another end, not recognised")
-    axes.set(xlabel="all seven mode parameters off by up to [%]", ylabel="starts [%]",
+    axes.set(xlabel="all seven mode parameters off by up to [%]", ylabel="initial guesses [%]",
              ylim=(-3, 103), xlim=(0, None))  # fmt: skip
     axes.grid(alpha=0.25)
     made.legend(*axes.get_legend_handles_labels(), frameon=False, loc="upper left", fontsize=8)
@@ -231,11 +232,11 @@ def draw(ends: list[End], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--quick", action="store_true", help="images of 0.04 mm/px")
-    parser.add_argument("--count", type=int, default=16, help="starts for each radius")
+    parser.add_argument("--count", type=int, default=16, help="initial guesses for each radius")
     parser.add_argument("--picture", type=Path, help="PNG; by default beside the record")
     options = parser.parse_args()
     pixel_size = QUICK_PIXEL if options.quick else Case().imaging.pixel_size
-    record = FOLDER / f"starts-{1000 * pixel_size:g}um.json"
+    record = FOLDER / f"initial_guesses-{1000 * pixel_size:g}um.json"
     record.parent.mkdir(parents=True, exist_ok=True)
     ends = explore(pixel_size, options.count, record)
     tell(ends)

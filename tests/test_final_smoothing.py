@@ -73,17 +73,17 @@ def test_the_paper_s_speckle_is_as_wide_as_its_pixels_differences_say() -> None:
 def test_a_small_model_error_needs_no_blur() -> None:
     """10 px speckles and w of 2 px, as in the paper's virtual experiment."""
     image = Speckle(SpeckleSpec(), SHAPE).image()
-    finish = FinalSmoothing.of(ImagePair(image, image, PLAIN), 2.0)
-    assert finish.blur_px == 0.0
-    assert "on the unfiltered images" in finish.text
+    final = FinalSmoothing.of(ImagePair(image, image, PLAIN), 2.0)
+    assert final.blur_px == 0.0
+    assert "on the unfiltered images" in final.text
 
 
 def test_a_blur_makes_speckles_as_wide_as_the_rule_says() -> None:
     image, model_error = blurred_noise(1.5), 2.0
-    finish = FinalSmoothing.of(ImagePair(image, image, PLAIN), model_error)
-    after = speckle_size(ndimage.gaussian_filter(image, finish.blur_px), EVERYWHERE)
+    final = FinalSmoothing.of(ImagePair(image, image, PLAIN), model_error)
+    after = speckle_size(ndimage.gaussian_filter(image, final.blur_px), EVERYWHERE)
     assert after == pytest.approx(WIDTHS * model_error, rel=0.05)
-    assert f"blurred by {finish.blur_px:.1f} px" in finish.text
+    assert f"blurred by {final.blur_px:.1f} px" in final.text
 
 
 def test_a_blurred_pair_has_the_contrast_of_the_blurred_reference() -> None:
@@ -103,7 +103,7 @@ GRID = PixelGrid.centred(400, 400, PIXEL)
 
 @pytest.mark.parametrize(("wavelength", "amplitude"), [(60.0, 3.0), (100.0, 4.0)])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_blurred_finish_comes_nearer_to_the_best_fit(
+def test_final_smoothing_comes_nearer_to_the_best_fit(
     wavelength: float, amplitude: float, seed: int
 ) -> None:
     """Speckles of 5 px, and waves of 3 or 4 px that the ansatz doesn't have."""
@@ -130,10 +130,10 @@ def test_a_blurred_finish_comes_nearer_to_the_best_fit(
         correlate(pair, ansatz, guess=guess, options=CorrelationOptions(final_smoothing_px=blur))
         for blur in (0.0, None)
     )
-    finish = smooth.final_smoothing
-    assert finish is not None
-    assert finish.speckle_size_px == pytest.approx(5.0, abs=0.5)
-    assert finish.blur_px > 2.0
+    final = smooth.final_smoothing
+    assert final is not None
+    assert final.speckle_size_px == pytest.approx(5.0, abs=0.5)
+    assert final.blur_px > 2.0
     best = fit_displacement(displacement(at), GRID, ansatz, a, mask)
     unfiltered, smoothed = (
         np.sqrt(np.mean((found.displacement() - best.displacement())[mask] ** 2)) / PIXEL

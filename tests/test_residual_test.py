@@ -86,7 +86,7 @@ def test_autocorrelation_of_white_noise_and_of_a_wave() -> None:
 @pytest.mark.parametrize(
     ("spectrum", "blur_px", "width_px"), [(0.14, 0.8, 3.6), (0.1, 1.0, 5.0), (0.05, 3.0, 12.4)]
 )
-def test_noise_and_leftover_are_told_apart_whatever_the_speckle(
+def test_noise_and_model_error_are_distinguished_whatever_the_speckle(
     spectrum: float, blur_px: float, width_px: float
 ) -> None:
     """Half a pixel of a wave that the ansatz lacks, or noise that leaves as large a residual."""
@@ -118,7 +118,7 @@ def test_lags_of_the_paper_s_speckle() -> None:
     assert "autocorrelation over 3 to 4 px" in said
 
 
-def test_unmatched_blocks_are_counted() -> None:
+def test_decorrelated_blocks_are_counted() -> None:
     rng = np.random.default_rng(4)
     f = np.repeat(np.repeat(rng.normal(size=(80, 80)), 4, axis=0), 4, axis=1)
     other = np.repeat(np.repeat(rng.normal(size=(80, 80)), 4, axis=0), 4, axis=1)
