@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 import synthetic_report as made_up
 
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.report import experiment
 from modeharvest.report.experiment import key_numbers, notes, number_cards
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.experiment import Run
@@ -116,3 +119,20 @@ def test_a_fixed_mode_has_no_parameters_off_the_ideal() -> None:
     (key,) = (k for k in key_numbers(fixed) if k.name == "deviation of the mode")
     assert (key.value, key.remark) == (None, "fixed at the ideal pattern")
     assert "% off the ideal" in note(summary(), "no pattern is observable")
+
+
+@dataclass(frozen=True)
+class Warm(Sensor):
+    """A sensor with a noise that this project doesn't have, as in docs/extending.md."""
+
+    dark_variance: float = 0.0
+
+    def noise_model(self, bits: int) -> tuple[float, float]:
+        constant, slope = super().noise_model(bits)
+        return constant + self.dark_variance, slope
+
+
+def test_the_report_knows_noise_of_any_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(experiment, "Sensor", Warm)
+    noisy = summary() | {"case": {"imaging": {"sensor": {"dark_variance": 1e-4}}}}
+    assert "noise-free averages" in note(noisy, "the first takes the whole residual")

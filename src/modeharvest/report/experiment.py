@@ -17,6 +17,7 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.sensor import Sensor
 from modeharvest.report.figures import fits
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import draw_eigenvalues, draw_load
@@ -415,11 +416,11 @@ def notes(summary: Summary) -> list[str]:
 def _standard_errors(summary: Summary) -> str:
     """What the standard errors mean for these images."""
     noise = [s["noise_sd"] for s in summary["snapshots"] if s.get("noise_sd") is not None]
-    sensor = summary.get("case", {}).get("imaging", {}).get("sensor", {})
+    sensor = Sensor(**summary.get("case", {}).get("imaging", {}).get("sensor", {}))
     text = text_of("experiment-noise-free")
     if noise:
         text = text_of("experiment-exposures", noise=max(noise))
-    elif sensor.get("read_noise") or sensor.get("full_well"):
+    elif sensor.noise_model(bits=16) != Sensor().noise_model(bits=16):
         text = text_of("experiment-averages")
     return text_of("experiment-errors", text=text)
 
