@@ -80,9 +80,7 @@ class Experiment:
         if not strains or not strains[0] > 0 or any(not b > a for a, b in pairwise(strains)):
             raise InputError(f"strains: expected ascending positive ones, got {list(strains)}")
         if strains[-1] >= 0.5:
-            raise InputError(
-                f"strains: expected less than 0.5 (0.128 is 12.8 %), got {strains[-1]}"
-            )
+            raise InputError(f"strains: expected below 0.5 (0.128 is 12.8 %), got {strains[-1]}")
         if not 0.0 < self.mesh_size < float("inf"):
             raise InputError(f"mesh_size: expected a positive length in mm, got {self.mesh_size}")
         require_edges(self.edges)

@@ -33,6 +33,7 @@ FORMAT = "modeharvest-solution-1"
 COMPRESSED = {"compression": 6, "shuffle": True}
 """Of datasets in HDF5."""
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
+_FLAT = 1e-6  # of a plane mesh's size: what its z may differ by
 MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
 
 
@@ -266,19 +267,26 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     return Solution(mesh, (Snapshot(nominal_strain, u[:, :2].copy()),), {"source": str(path)})
 
 
-def read_plane_mesh(path: Path | str) -> Mesh:
-    """The T3, T6, Q4, Q8 or Q9 mesh in the x-y plane of any file that meshio reads.
-
-    InputError if the file can't be read, or has no such cells or several types of them.
-    """
-    return plane_mesh(read_any_mesh(path), path)
-
-
 def plane_mesh(source: meshio.Mesh, path: Path | str) -> Mesh:
-    """What :func:`read_plane_mesh` makes of a file that was read."""
+    """The T3, T6, Q4, Q8 or Q9 mesh with z = const of a file that was read.
+
+    InputError if it has no such cells or several types of them, or isn't plane.
+    """
     types = sorted({block.type for block in source.cells})
     found = [e for e, name in MESHIO_NAME.items() if name in types]
     if len(found) != 1:
         known = list(MESHIO_NAME.values())
         raise InputError(f"expected one type of cells among {known} in {path}, got {types}")
-    return Mesh(source.points[:, :2], source.get_cells_type(MESHIO_NAME[found[0]]), found[0])
+    nodes = in_plane(source.points, f" in {path}")
+    return Mesh(nodes, source.get_cells_type(MESHIO_NAME[found[0]]), found[0])
+
+
+def in_plane(points: FloatArray, where: str = "") -> FloatArray:
+    """(n, 2) x and y of points (n, 2) or (n, 3); InputError unless they are finite, z = const."""
+    if not np.isfinite(points).all():
+        raise InputError(f"expected finite node positions{where}, got NaN or infinity")
+    z = points[:, 2:]
+    if z.size and np.ptp(z) > _FLAT * np.ptp(points[:, :2]):
+        got = f"z from {z.min():.5g} to {z.max():.5g}"
+        raise InputError(f"expected a plane mesh, z = const{where}, got {got}")
+    return points[:, :2]

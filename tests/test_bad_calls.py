@@ -523,6 +523,16 @@ def test_ctrl_c_counts_even_at_the_end() -> None:
 # --- environments -------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("options", "shown"), [("", 0), ("-W default", 1)])
+def test_warnings_of_libraries_are_not_printed_beside_a_line(options: str, shown: int) -> None:
+    loud = "root.main = lambda: warnings.warn('loud', RuntimeWarning)"
+    code = (
+        f"import warnings, modeharvest.cli.root as root; {loud}; from modeharvest import __main__"
+    )
+    done = run(f"{options} -c", f"{code}; __main__.start()")
+    assert done.stderr.count("loud") == shown
+
+
 def test_help_needs_no_folder_of_the_user() -> None:
     done = run("-m modeharvest cases", HOME=None, XDG_CACHE_HOME=None)
     assert done.returncode == 0

@@ -38,6 +38,7 @@ from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxi
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.meshing import quiet_gmsh
 from modeharvest.fem.specimen import Specimen
+from modeharvest.util import machine
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -225,6 +226,13 @@ def test_three_degenerate_modes_make_a_flower() -> None:
         branch = follow(cell_path, modes, combination, [1.2 * found.load])
         assert ranked[at][1].energy == pytest.approx(branch.states[0].energy, rel=1e-8)
         assert ranked[at][1].negative_eigenvalues == negative
+
+
+def test_more_points_than_there_is_memory_for_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before their arrays are made: a case may divide a specimen into a million elements."""
+    monkeypatch.setattr(machine, "available_bytes", lambda: 5e6)
+    with pytest.raises(InputError, match=r"a homogenized body of 1.44e\+03 points to fit"):
+        HomogenizedBody(rectangle_mesh(range(20), range(20)), rve(), FIXED)
 
 
 def test_of_two_critical_modes_no_branch_is_followed_twice() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.report.homogenization import homogenization_report
 from modeharvest.report.model import print_report
-from modeharvest.runs.homogenization.case import HomogenizationCase
+from modeharvest.runs.homogenization.case import FileMode, HomogenizationCase
 from modeharvest.runs.homogenization.pipeline import HomogenizationRun
 from modeharvest.runs.homogenization.results import aligned
 from modeharvest.util.errors import InputError
@@ -247,6 +248,16 @@ def test_what_can_not_be_homogenized_is_refused(
     path.write_text("\n".join(lines), "utf-8")
     with pytest.raises(InputError, match=message):
         HomogenizationCase.read(path)
+
+
+def test_the_number_of_a_mode_may_be_large() -> None:
+    """It is compared with what there is, and takes no memory: 10^13 once took all there was."""
+    tracemalloc.start()
+    try:
+        HomogenizationCase(mode=FileMode(path="modes.h5", numbers=(10**6,)))
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.dolfinx

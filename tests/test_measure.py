@@ -292,9 +292,13 @@ def test_light_that_changes_along_the_image_does_not_enter_the_displacement() ->
         ("size", "expected images of one size"),
         ("mask size", "expected images of one size"),
         ("black mask", "expected a mask with material"),
+        ("mask of NaN", "expected a mask of finite numbers"),
+        ("pixel size", "expected a pixel size [mm] of 1e-09 to 1e+06, got 1e-300"),
         ("mesh", "expected a mesh that covers the mask"),
         ("mesh beside", "expected a mesh on the image"),
         ("mesh twice", "expected elements that don't overlap"),
+        ("mesh tilted", "expected a plane mesh, z = const in"),
+        ("mesh of NaN", "mesh.vtu, got NaN or infinity"),
         ("blank mask", "expected speckle on the material"),
         ("no contrast", "expected an image with contrast"),
         ("noise", "expected a speckle pattern"),
@@ -315,6 +319,7 @@ def test_bad_input_is_one_line(
         "size": rng.integers(0, 255, (50, 60)).astype(np.uint8),
         "mask size": np.full((50, 60), 7, np.uint8),
         "black mask": np.zeros(GRID.shape, np.uint8),
+        "mask of NaN": np.full(GRID.shape, np.nan, np.float32),
         "blank mask": np.uint8(255) * (np.hypot(*np.meshgrid(GRID.x, GRID.y)) < 0.3),
         "no contrast": np.full(GRID.shape, 7, np.uint8),
         "noise": rng.integers(0, 255, GRID.shape).astype(np.uint8),
@@ -323,11 +328,13 @@ def test_bad_input_is_one_line(
     if what in images:
         write_image(bad, np.ascontiguousarray(images[what]))
     options = ["--mask", bad if "mask" in what else plate.folder / "mask.tif"]
-    meshes = {"mesh": ([0.0, 0.0], 1), "mesh beside": ([90.0, 0.0], 1), "mesh twice": ([0, 0], 2)}
-    if what in meshes:
-        move, times = meshes[what]
-        corners = np.array([[-0.9, 0.5], [0.0, 0.5], [-0.9, 0.8]]) + move
-        nodes = np.column_stack([np.tile(corners, (times, 1)), np.zeros(3 * times)])
+    options += ["--pixel-size", "1e-300"] if what == "pixel size" else []
+    if what.startswith("mesh"):
+        times = 2 if what == "mesh twice" else 1
+        corners = np.array([[-0.9, 0.5, 0.0], [0.0, 0.5, 0.0], [-0.9, 0.8, 0.0]])
+        corners[:, 0] += 90.0 * (what == "mesh beside")
+        corners[2, 2] = {"mesh tilted": 0.2, "mesh of NaN": np.nan}.get(what, 0.0)
+        nodes = np.tile(corners, (times, 1))
         cells = [("triangle", np.arange(3 * times).reshape(-1, 3))]
         meshio.Mesh(nodes, cells).write(tmp_path / "mesh.vtu")
         options += ["--mesh", tmp_path / "mesh.vtu", "--pixel-size", "0.01"]

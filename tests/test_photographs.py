@@ -231,6 +231,13 @@ def test_constant_and_nan_images_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "nan.tif", holed)
     with pytest.raises(InputError, match="1 NaN or infinite"):
         read_photograph(tmp_path / "nan.tif")
+    tifffile.imwrite(tmp_path / "large.tif", 1e300 * speckle().astype(np.float64))
+    with pytest.raises(InputError, match="NaN or infinite"):
+        read_photograph(tmp_path / "large.tif")
+
+
+def test_a_line_of_pixels_has_no_speckle() -> None:
+    assert neighbour_correlation(np.arange(40.0, dtype=np.float32)[None] % 7) == 0.0
 
 
 def test_a_frame_of_another_size_is_refused(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from modeharvest.fem.field import Mesh, with_mid_sides
+from modeharvest.fem.field import Mesh, in_plane, with_mid_sides
 from modeharvest.fem.meshing import REVERSED_T6
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
@@ -83,7 +83,7 @@ def sound_t6(points: FloatArray, cells: IntArray) -> ForeignMesh:
     or folded one.
     """
     used, numbers = np.unique(cells, return_inverse=True)
-    nodes, cells = _in_plane(points[used]), numbers.reshape(cells.shape).astype(np.int64)
+    nodes, cells = in_plane(points[used]), numbers.reshape(cells.shape).astype(np.int64)
     notes: list[str] = []
     if cells.shape[1] == 3:
         nodes, cells = with_mid_sides(nodes, cells)
@@ -157,15 +157,6 @@ def _refuse_unsound(mesh: Mesh) -> None:
             f"expected elements that are neither flat nor folded, got {len(bad)}, the first at "
             f"({x:.5g}, {y:.5g}) mm"
         )
-
-
-def _in_plane(points: FloatArray) -> FloatArray:
-    if not np.isfinite(points).all():
-        raise InputError("expected finite node positions, got NaN or infinity")
-    if points.shape[1] == 3 and np.ptp(points[:, 2]) > 1e-9 * np.ptp(points[:, :2]):
-        low, high = points[:, 2].min(), points[:, 2].max()
-        raise InputError(f"expected a plane mesh, z = const, got z from {low:.5g} to {high:.5g} mm")
-    return points[:, :2]
 
 
 def _smallest_jacobians(mesh: Mesh) -> FloatArray:

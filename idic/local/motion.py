@@ -120,10 +120,7 @@ def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tupl
     if pair.mask is not None and pair.deformed_mask is not None:
         plane = edge_motion(pair.mask, pair.deformed_mask, pair.grid)
     if plane is None:
-        return (
-            np.zeros_like,
-            "v0 starts from no motion: neither holes nor whole boundaries are known.",
-        )
+        return (np.zeros_like, "v0 starts from no motion: neither holes nor boundaries are known.")
     return partial(_affine, plane), (
         f"v0 starts from the boundaries: {100 * plane[0, 1]:+.1f} % along x and "
         f"{100 * plane[1, 2]:+.1f} % along y."

@@ -92,9 +92,7 @@ class SpecimenTable:
             )
         names = [region.name for region in self.regions]
         if len(set(names)) < len(names):
-            raise InputError(
-                f"specimen.regions: expected names that differ, got {', '.join(names)}"
-            )
+            raise InputError(f"specimen.regions: expected different names, got {', '.join(names)}")
 
 
 SIDES = ("left", "right", "bottom", "top")

@@ -227,9 +227,12 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
 def read_mask(path: Path | str) -> BoolArray:
     """Read a mask (rows, cols): True where the file isn't zero, that is, where there is material.
 
-    InputError if the file is missing, cut short, not one plane image, or zero everywhere.
+    InputError if the file is missing, cut short, not one plane image, zero everywhere, or holds
+    NaN or infinity.
     """
     levels = read_stored(Path(path), single=True).levels
+    if not np.isfinite(levels).all():
+        raise InputError(f"expected a mask of finite numbers at {path}, got NaN or infinity")
     mask = (levels if levels.ndim == 2 else levels.max(axis=2)) != 0
     if not mask.any():
         raise InputError(f"expected a mask with material (above 0) at {path}, got black everywhere")

@@ -76,7 +76,8 @@ def read_photograph(path: Path | str) -> Photograph:
     levels = stored.levels
     if levels.ndim == 3 and (levels == levels[..., :1]).all():  # grey, stored as colour
         levels = levels[..., 0]
-    image = np.ascontiguousarray(files.luma(levels.astype(np.float32)))
+    with np.errstate(over="ignore"):  # what is infinite then is refused
+        image = np.ascontiguousarray(files.luma(levels.astype(np.float32)))
     files.require_visible(image, f"at {path}")
     bits, full_scale = _scale(levels)
     saturated, black = _cut_off(levels, full_scale)
@@ -165,12 +166,11 @@ def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> f
     total = scipy.ndimage.uniform_filter(image * weight, _MEAN_PX)
     share = scipy.ndimage.uniform_filter(weight, _MEAN_PX)
     reach = _MEAN_PX // 2  # beyond it the mean is not one-sided, so a ramp leaves nothing
-    interior = (
-        (slice(reach, -reach),) * 2 if min(image.shape) > 2 * _MEAN_PX else (slice(None),) * 2
-    )
+    is_large = min(image.shape) > 2 * _MEAN_PX
+    interior = (slice(reach, -reach) if is_large else slice(None),) * 2
     fine = (weight * (image - total / np.maximum(share, 1e-6)))[interior].astype(np.float64)
     power = float((fine**2).mean())
-    if power == 0.0:
+    if power == 0.0 or 1 in fine.shape:
         return 0.0
     pairs = 0.5 * (np.mean(fine[1:] * fine[:-1]) + np.mean(fine[:, 1:] * fine[:, :-1]))
     return float(pairs / power)

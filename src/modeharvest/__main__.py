@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
+import warnings
 
 
 def start() -> None:
     """Load the command line and run it; Ctrl-C may come before there is anything to catch it."""
+    if not sys.warnoptions:  # else libraries would print theirs beside our lines
+        warnings.simplefilter("ignore")
     try:
         from modeharvest.cli.root import main
     except KeyboardInterrupt:

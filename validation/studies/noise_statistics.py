@@ -283,7 +283,5 @@ class NoiseAnalysis:
         sd = done[done["curvature_sd_mm"].notna()].set_index("level")["curvature_sd_mm"]
         ratios = {float(level): float(sd[level] / sd[0.0]) for level in sd.index if level}
         lost = int((done["outcome"] != "converged").sum())
-        against = {
-            cause: _against(levels, predicted["bound"], sd) for cause, sd in predicted.items()
-        }
+        against = {c: _against(levels, predicted["bound"], sd) for c, sd in predicted.items()}
         return cls(points, row, predicted, against, ratios, lost)

@@ -27,8 +27,10 @@ from modeharvest.fem.sparse_factor import factorise
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
+from modeharvest.util.machine import require_memory
 
 _FIRST_ORDER = 4  # generalised strains without modes: F̄
+_STATES = 4  # of all RVEs in memory at a time, at least
 
 
 class _Region(NamedTuple):
@@ -86,6 +88,7 @@ class HomogenizedBody:
         self.length = float(length or (high - low)[0] * math.sqrt(self.copies))
         self._lattice_nodes = np.unique(mesh.cells[lattice])
         points = points or (3 if mesh.element == "Q9" else 2)
+        self._require_memory(points)
         self.regions = [self._region(lattice, points, self.mode_count)]
         if not lattice.all():
             self.regions.append(self._region(~lattice, points, 0))
@@ -160,6 +163,14 @@ class HomogenizedBody:
         for q in found:
             q[..., :_FIRST_ORDER] += np.eye(2).ravel()
         return [q.reshape(-1, q.shape[-1]) for q in found]
+
+    def _require_memory(self, points: int) -> None:
+        """Refuse more RVEs than there is memory for, roughly."""
+        (elements, nodes), m = self.mesh.cells.shape, self.mode_count
+        count, strains = points**2 * elements, (_FIRST_ORDER + 3 * m) * (2 + m) * nodes
+        own = sum(rve.cell.reduction.size for rve in self.rves) / self.comm.size
+        what = f"a homogenized body of {count:.3g} points"
+        require_memory(8.0 * count * (_STATES * own + 2 * strains), what, "take fewer elements")
 
     def _region(self, chosen: BoolArray, points: int, m: int) -> _Region:
         cells = self.mesh.cells[chosen]

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from modeharvest.fem.field import Mesh, read_mesh, read_plane_mesh, write_mesh
+from modeharvest.fem.field import Mesh, plane_mesh, read_any_mesh, read_mesh, write_mesh
 from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.finite_element.files import (
     Given,
@@ -97,7 +97,7 @@ class MeasureCase:
     def __post_init__(self) -> None:
         Brightness(self.brightness, self.brightness)  # checks its degree
         if self.pixel_size is not None:
-            require_within("expected a pixel size [mm]", self.pixel_size, 0.0, above=True)
+            require_within("expected a pixel size [mm]", self.pixel_size, 1e-9, 1e6)
         for path in (self.reference, *self.files.values(), self.mask, self.mesh):
             if path is not None:
                 require_file(path, "a file", "check its name")
@@ -178,7 +178,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
         InputError if that isn't on the image, or overlaps itself.
         """
-        mesh, unit = quadratic(read_plane_mesh(path)), self.case.unit
+        mesh, unit = quadratic(plane_mesh(read_any_mesh(path), path)), self.case.unit
         warnings: tuple[str, ...] = ()
         located = locate(mesh.nodes, mesh.cells, mesh.element, self.grid, str(path))
         covered, here = located.mask, f"in {unit}, from the middle of the image, x right, y up"
@@ -235,13 +235,11 @@ class MeasureRun(StagedRun[MeasureCase]):
             known = 0.0 * body.mesh.nodes if before is None else before.displacement
             start = block_motion(pair, body, known, names)
             light = self.case.brightness
-            result = displacement_from(
-                start, pair, body, light_degree=light, progress=self.progress
-            )
-            write_result(tables[0], result, given)
-            write_vtu(tables[1], result, given)
-            write_csv(tables[2], result, given=given)
-            return *tables, *write_maps(folder / name, result, given=given)
+            found = displacement_from(start, pair, body, light_degree=light, progress=self.progress)
+            write_result(tables[0], found, given)
+            write_vtu(tables[1], found, given)
+            write_csv(tables[2], found, given=given)
+            return *tables, *write_maps(folder / name, found, given=given)
 
         self.do(f"image {name}", key, work)
         return read_result(tables[0])

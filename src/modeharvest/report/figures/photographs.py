@@ -274,9 +274,7 @@ def _true_displacement(state: PhotographState) -> FloatArray | None:
     return None if truth is None else truth.displacement
 
 
-WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(
-    lambda state: state.frame.whole, _true_displacement
-)
+WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(lambda s: s.frame.whole, _true_displacement)
 
 WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
 _LEGEND = 0.26  # [in]

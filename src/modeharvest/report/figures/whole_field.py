@@ -128,9 +128,7 @@ def _mode_rows(numbers: Sequence[Numbers]) -> Iterable[tuple[Cell, ...]]:
         modes: list[Numbers] = [
             n["modes"][i] if i < len(n["modes"]) else {"parameters": ()} for n in numbers
         ]
-        largest = [
-            mode.get(key) for mode in modes for key in ("v_max_mm", "", "correlated_v_max_mm")
-        ]
+        largest = [m.get(key) for m in modes for key in ("v_max_mm", "", "correlated_v_max_mm")]
         yield (f"largest |v{i + 1}|", "mm", *largest)
         found = [{p["name"]: p for p in mode["parameters"]} for mode in modes]
         units = {name: p["unit"] for column in found for name, p in column.items()}

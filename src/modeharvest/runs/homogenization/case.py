@@ -230,7 +230,7 @@ class HomogenizationCase(CaseModel):
         count, numbers = len(FAMILIES[specimen.stacking](specimen)), self.mode.numbers
         if isinstance(self.mode, FileMode) and self.mode.is_computed:
             count = max(numbers, default=1)  # as many as the file has
-        if len(set(numbers)) < len(numbers) or not set(numbers) <= set(range(1, count + 1)):
+        if len(set(numbers)) < len(numbers) or not all(1 <= n <= count for n in numbers):
             raise InputError(
                 f"mode: expected different numbers from 1 to {count} in {specimen.stacking} "
                 f"stacking, got {numbers}"
