@@ -12,20 +12,19 @@ import pickle
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import gmsh
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
-from scipy.special import ellipe
 
-from modeharvest.fem.field import Mesh
 from modeharvest.fem.specimen import Imperfection, Specimen, centred
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.machine import require_memory
+
+if TYPE_CHECKING:  # imported where it is needed: a child that meshes starts in half the time
+    from modeharvest.fem.field import Mesh
 
 
 def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
@@ -61,7 +60,7 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
         weight = np.cos(0.5 * np.pi * fade)[:, None] ** 2
         outwards = scale * (arm[near] / distance[near][:, None])
         nodes[near] += weight * (move + grow * outwards)
-    return Mesh(nodes, mesh.cells, mesh.element)
+    return replace(mesh, nodes=nodes)
 
 
 # Reflecting a T6 element turns it inside out; this reorders its nodes counter-clockwise.
@@ -110,6 +109,8 @@ def quarter_polygon(
     radii : the hole's, along x and y [mm].
     size : target edge length of the elements [mm].
     """
+    from scipy.special import ellipe
+
     low, high = heights
     a, b = radii
     arc = float(max(a, b) * ellipe(1.0 - (min(a, b) / max(a, b)) ** 2))
@@ -156,6 +157,12 @@ def require_size(size: float, area: float) -> None:
 
 def join(blocks: list[MeshBlock], tolerance: float) -> Mesh:
     """One T6 mesh of placed blocks; nodes closer than ``tolerance`` [mm] become one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    from modeharvest.fem.field import Mesh
+
     offsets = np.cumsum([0] + [len(b.nodes) for b in blocks[:-1]])
     nodes = np.vstack([b.nodes for b in blocks])
     cells = np.vstack([b.cells + k for b, k in zip(blocks, offsets, strict=True)])
@@ -269,8 +276,7 @@ def mesh_block(
 @contextmanager
 def quiet_gmsh() -> Iterator[None]:
     """An empty gmsh model that prints nothing; models that the caller has open are kept."""
-    ours = not gmsh.isInitialized()
-    if ours:
+    if ours := not gmsh.isInitialized():
         gmsh.initialize(interruptible=False)
     before = gmsh.model.getCurrent()
     numbers = {"Mesh.Algorithm": 6, "Mesh.SecondOrderLinear": 0, "Mesh.MeshSizeMax": 1e22}
@@ -303,10 +309,9 @@ def _current_block() -> MeshBlock:
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     _, connectivity = gmsh.model.mesh.getElementsByType(9)  # 9: the six-node triangle
     cells = connectivity.reshape(-1, 6)
-    used = np.unique(cells)
+    used, numbers = np.unique(cells, return_inverse=True)
     position = dict(zip(tags, coordinates.reshape(-1, 3)[:, :2], strict=True))
-    nodes = np.array([position[tag] for tag in used])
-    return MeshBlock(nodes, np.searchsorted(used, cells).astype(np.int64))
+    return MeshBlock(np.array([position[tag] for tag in used]), numbers.astype(np.int64))
 
 
 def mesh_boundaries(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -13,7 +11,6 @@ import meshio
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_fem_simulate import PATIENT
 
 from modeharvest.fem.bloch.critical import critical_at, first_critical
 from modeharvest.fem.bloch.postbuckling import follow
@@ -360,30 +357,6 @@ def test_positions_of_the_rve_are_averaged() -> None:
         mass, phi = element.cell.nodal_mass, element.shapes[0].ravel()
         mean = phi @ (mass @ fluctuation.ravel()) / (0.5 * mass.sum())
         assert mean == pytest.approx(v, rel=1e-9)
-
-
-PARALLEL = """
-from mpi4py import MPI
-from test_fem_homogenization import LOOSE, homogenize, lattice_body, rve
-found = homogenize(lattice_body(rve(), LOOSE), [0.04, 0.1])
-assert MPI.COMM_WORLD.size == 2
-if MPI.COMM_WORLD.rank == 0:
-    print(repr(float(found.critical.load)), repr(found.states[-1].energy))
-"""
-
-
-def test_two_ranks_find_what_one_does() -> None:
-    alone = homogeneous(LOOSE)
-    command = ["mpirun", "-n", "2", sys.executable, "-c", PARALLEL]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=600, env=PATIENT, check=False,
-        cwd=Path(__file__).parent,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    load, energy = map(float, done.stdout.split())
-    assert alone.critical is not None
-    assert load == pytest.approx(alone.critical.load, rel=1e-9)
-    assert energy == pytest.approx(alone.states[-1].energy, rel=1e-9)
 
 
 def test_an_rve_cut_about_a_point_is_the_same_lattice() -> None:

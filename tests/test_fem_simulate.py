@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -238,47 +234,6 @@ def test_info_tells_how_it_came_about() -> None:
     assert len({len(column) for column in curve.values()}) == 1
     assert 0 < info["factorisations"] <= 60
     assert info["unknowns"] == 2 * len(reference().mesh.nodes)
-
-
-PARALLEL = """
-import sys
-from mpi4py import MPI
-from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.simulate import simulate
-from modeharvest.fem.specimen import Specimen
-solution = simulate(Experiment(Specimen(4, 6), strains=(0.1, 0.15), mesh_size=0.5))
-assert MPI.COMM_WORLD.size == 2
-solution.write(f"{sys.argv[1]}/rank{MPI.COMM_WORLD.rank}.h5")
-"""
-
-
-PATIENT = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}
-"""For Open MPI: a rank that waits leaves the processor to the others, whoever else needs it."""
-
-
-def test_two_ranks_find_the_same(tmp_path: Path) -> None:
-    command = ["mpirun", "-n", "2", sys.executable, "-c", PARALLEL, str(tmp_path)]
-    run = subprocess.run(
-        command, capture_output=True, text=True, timeout=1800, env=PATIENT, check=False
-    )
-    assert run.returncode == 0, run.stderr
-    expected = reference()
-    for rank in (0, 1):
-        found = Solution.read(tmp_path / f"rank{rank}.h5")
-        critical, wanted = found.info["critical"], expected.info["critical"]
-        assert critical["strain"] == pytest.approx(wanted["strain"], abs=1e-8)
-        assert critical["negative_pivots_below"] == 0
-        assert critical["negative_pivots_above"] == 1
-        assert critical["pattern_overlap_by_cell"] == pytest.approx(
-            wanted["pattern_overlap_by_cell"], rel=1e-5
-        )
-        assert np.array_equal(found.mesh.nodes, expected.mesh.nodes)
-        for s in found.snapshots:
-            other = by_branch(expected, s.nominal_strain)[s.branch]
-            np.testing.assert_allclose(s.displacement, other.displacement, rtol=0, atol=1e-8)
-            assert s.energy == pytest.approx(other.energy, rel=1e-10)
-            assert s.reaction == pytest.approx(other.reaction, rel=1e-8)
-            assert s.negative_pivots == other.negative_pivots
 
 
 @pytest.mark.parametrize(

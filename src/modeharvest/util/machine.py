@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from modeharvest.util.errors import InputError
 
@@ -78,11 +78,8 @@ def _cached_in(folder: Path) -> float:
 
 def _readable(count: float) -> str:
     """1.2e10 as "12 GB"."""
-    for unit in _UNITS:
-        if count < 1000.0 or unit == _UNITS[-1]:
-            return f"{count:.3g} {unit}"
-        count /= 1000.0
-    return f"{count:g}"
+    power = next((k for k in range(6) if count < 1000.0 ** (k + 1)), 6)
+    return f"{count / 1000.0**power:.3g} {_UNITS[power]}"
 
 
 _MARKS = ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_SIZE", "PMI_RANK")
@@ -126,5 +123,4 @@ def on_first(work: Callable[[], T]) -> T:
     value, failure = world.bcast(done)
     if failure is not None:
         raise failure
-    found: T = value
-    return found
+    return cast(T, value)
