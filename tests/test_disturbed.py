@@ -118,9 +118,9 @@ class Pipeline:
 GIVEN = "--solution given.h5"
 PIPELINES = {
     "run": Pipeline(f"run case.toml {GIVEN}", write_case, (40_000, 400_000)),
-    "make": Pipeline(f"benchmark make case.toml {GIVEN}", write_case, (40_000, 250_000)),
+    "make": Pipeline(f"benchmark make case.toml {GIVEN}", write_case, (40_000, 500_000)),
     "harvest": Pipeline("harvest test.toml", write_photographs, (40_000, 1_400_000)),
-    "study": Pipeline(f"study study.toml {GIVEN} --workers 1", write_study, (40_000, 600_000)),
+    "study": Pipeline(f"study study.toml {GIVEN} --workers 1", write_study, (40_000, 1_500_000)),
     "fem": Pipeline("fem fem.toml", write_fem, (8_192, 40_000)),
     "modes": Pipeline("modes cell.toml", write_lattice, (8_192, 300_000)),
 }

@@ -176,7 +176,7 @@ BLUR = 2.0
 RADIUS = 7
 """Of a window [binned px]."""
 WARPS = 4
-"""Iterations on each level of the flow's own pyramid; more do not make its error smaller."""
+"""Iterations on each level of the flow's own pyramid; more mend a few stray points alone."""
 STEP = 2
 """Distance of the field's points [binned px]."""
 DITHER = 1e-3
