@@ -293,6 +293,28 @@ def test_the_recipes_work_as_printed(
     assert area(space["slotted"]) == pytest.approx(3.2 - 0.48 + (4 - math.pi) * 0.15**2, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("Exit;", "got: a file that ends gmsh"),
+        ('Error("unfinished");', "got: unfinished"),
+        ("Box(;", "syntax error"),
+        ('Printf("read");\nAbort;', "expected a surface, got none"),
+        ('Printf("read");\nExit;', "got: a file that ends gmsh"),
+    ],
+)
+def test_a_geometry_that_ends_gmsh_does_not_end_the_program(
+    text: str, message: str, tmp_path: Path
+) -> None:
+    """And one that is refused leaves nothing behind that spoils the next one."""
+    path = tmp_path / "cell.geo"
+    path.write_text(text, "utf-8")
+    with pytest.raises(InputError, match=message):
+        read_cell(path, size=0.5)
+    path.write_text('SetFactory("OpenCASCADE"); Rectangle(1) = {0, 0, 0, 2, 2};', "utf-8")
+    assert area(read_cell(path, size=0.5)) == pytest.approx(4.0)
+
+
 def test_a_file_that_crashes_gmsh_is_reported_in_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,7 +34,11 @@ _PROBE = """
 import gmsh, sys
 gmsh.initialize(interruptible=False)
 gmsh.option.setNumber("General.Terminal", 0)
-gmsh.merge(sys.argv[1])
+try:
+    gmsh.merge(sys.argv[1])
+except Exception as error:
+    sys.exit(str(error) or gmsh.logger.getLastError())
+print("read")
 """
 _PROBE_SECONDS = 300.0
 _FARTHEST = 1e9
@@ -97,22 +101,21 @@ def cell_from_gmsh(
 
 
 def _require_readable(path: Path) -> None:
-    """Let a child read the file first: gmsh aborts the process on some damaged ones."""
+    """Let a child read the file first: gmsh aborts the process on some, or ends it."""
     with reading(path, "a file that gmsh reads", "export it again"):
         command = [sys.executable, "-P", "-c", _PROBE, str(path)]
         done = subprocess.run(command, capture_output=True, timeout=_PROBE_SECONDS, check=False)
         if done.returncode < 0:
             raise ValueError(f"a file that makes gmsh crash (signal {-done.returncode})")
+        if not done.stdout.endswith(b"read\n"):
+            raise ValueError(done.stderr.decode(errors="replace") or "a file that ends gmsh")
 
 
 def _merge(path: Path) -> None:
     unit = gmsh.option.getString("Geometry.OCCTargetUnit")
     gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
     try:
-        gmsh.merge(str(path))
-    except Exception as error:  # gmsh raises nothing else
-        got = _message(error)
-        raise InputError(f"expected a file that gmsh reads at {path}, got: {got}") from error
+        gmsh.merge(str(path))  # which a child has read
     finally:
         gmsh.option.setString("Geometry.OCCTargetUnit", unit)
 
@@ -122,6 +125,8 @@ def _from_model(
 ) -> UnitCell:
     """The cell in gmsh's current model."""
     mm = millimetres(unit)
+    if not gmsh.model.getEntities(2):
+        raise InputError(f"{source}: expected a surface, got none")
     if size is not None:
         low, high = np.reshape(gmsh.model.getBoundingBox(-1, -1), (2, 3))[:, :2]
         require_size(size, mm**2 * float(np.prod(high - low)))

@@ -170,10 +170,8 @@ def subset_field(pair: ImagePair, options: SubsetOptions | None = None) -> Local
             results = sorted(folder.glob("subsets_*.csv"))
             if results:
                 field = read_field(results[0], grid)
-                correlation = read_table(results[0])["cost_zncc"]
-                sd = predicted_sd(
-                    pair.reference, inside, grid, field, correlation, options.subset_px
-                )
+                zncc = read_table(results[0])["cost_zncc"]
+                sd = predicted_sd(pair.reference, inside, grid, field, zncc, options.subset_px)
                 return replace(field, sd=sd, source=f"pyvale, subsets of {options.subset_px} px")
     raise InputError(f"subset DIC: expected a result of pyvale, got none: {reason}")
 

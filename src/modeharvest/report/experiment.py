@@ -129,12 +129,10 @@ def draw_hero(state: SnapshotState) -> Figure:
     images, strain = state.data.images, state.data.strains[state.k]
     map_frame = state.view.map_frame()
     if fits.has_mode(0)(state):
-        length = fits.UM * lengths(pattern_field(state.result, map_frame.grid))
+        size = fits.UM * lengths(pattern_field(state.result, map_frame.grid))
     else:
-        length = map_frame.average(fits.UM * lengths(state.comparison.w))
-    return fits.draw_dissolving(
-        state, images.deformed(strain), images.deformed_mask(strain), length
-    )
+        size = map_frame.average(fits.UM * lengths(state.comparison.w))
+    return fits.draw_dissolving(state, images.deformed(strain), images.deformed_mask(strain), size)
 
 
 def _image(state: SnapshotState) -> Figure:

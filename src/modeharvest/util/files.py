@@ -289,5 +289,5 @@ def sha256_of(path: Path | str) -> str:
     try:
         with Path(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
+    except (OSError, ValueError):  # ValueError: a name with a null character
         return ""
