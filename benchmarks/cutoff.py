@@ -23,11 +23,10 @@ from whole_field import noisy
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
-from modeharvest.idic.setup import AnsatzOptions
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec

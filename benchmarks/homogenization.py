@@ -375,10 +375,10 @@ def positions() -> None:
         state = (direct := simulate(Experiment(Specimen(*size), strains=(load,)))).at(load)
         exact = direct.info["critical"]["strain"]
         for count in range(1, most + 1):
-            found, body, _ = homogenized_specimen(
+            whole, body, _ = homogenized_specimen(
                 centred(count), size, parts, (load,), quarter=True
             )
-            e, reached = found.critical.load if found.critical else np.nan, found.states[-1]
+            e, reached = whole.critical.load if whole.critical else np.nan, whole.states[-1]
             row(
                 f"{size[0]} x {size[1]}, {load:.1%}", f"{count} x {count}",
                 body.point_count * count**2, f"{e:.3%} ({e / exact - 1:+.2%})",

@@ -290,7 +290,7 @@ def measure(row: Row, motion: Motion, pairs: int, number: int = 0) -> Measured:
         predicted.append([result.covariance(known) for result in found])
     to_px = np.einsum("pcn,pcm->nm", S[::EVERY], S[::EVERY]) / (2 * len(S[::EVERY])) / PIXEL**2
     made = (np.array(values) for values in (errors, bounds, predicted, efficient))
-    return Measured(*made, to_px)
+    return Measured(*made, to_px=to_px)
 
 
 @dataclass(frozen=True)

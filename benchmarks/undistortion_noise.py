@@ -71,7 +71,8 @@ def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: flo
             noisy = [undistorted(image, lens) for image in noisy]
         if blur > 0.0:
             noisy = [ndimage.gaussian_filter(image, blur) for image in noisy]
-        result = correlate(ImagePair(*noisy, GRID, mask), ANSATZ, guess=unknowns, options=options)
+        f, g = noisy
+        result = correlate(ImagePair(f, g, GRID, mask), ANSATZ, guess=unknowns, options=options)
         found.append(result.unknowns)
         residual.append(result.residual_rms**2 / (2 * noise**2))
     x, y = GRID.x[INNER][::5], GRID.y[INNER][::5]
@@ -117,7 +118,8 @@ def noise_free(lens: CameraDistortion | None) -> float:
     mask = np.zeros(GRID.shape, dtype=np.bool_)
     mask[INNER, INNER] = True
     options = CorrelationOptions(levels=(Level(1, 0.0),))
-    result = correlate(ImagePair(*images, GRID, mask), ANSATZ, guess=unknowns, options=options)
+    f, g = images
+    result = correlate(ImagePair(f, g, GRID, mask), ANSATZ, guess=unknowns, options=options)
     off = ANSATZ.displacement(result.unknowns - unknowns, GRID.x[INNER], GRID.y[INNER])
     return float(np.sqrt(np.mean(off**2)) / GRID.pixel_size)
 

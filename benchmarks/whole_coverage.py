@@ -33,11 +33,10 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.fields import field_of, nodal_gradient
 from modeharvest.idic.finite_element.measure import measure_displacement
-from modeharvest.idic.setup import AnsatzOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.mapping.isoparametric import interpolate, locate

@@ -25,7 +25,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from modeharvest.imaging.mapping.elements import shape_functions
 from numpy.typing import NDArray
 from scipy import ndimage
 from whole_field import noisy, specimen_of
@@ -41,6 +40,7 @@ from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.elements import shape_functions
 
 EDGE_PX, LONG_PX = 10, (0.3, 0.5)
 APART_PX = 40
