@@ -217,13 +217,11 @@ class MatchedImages:
             )
         return found
 
-    def _block_gradients(
-        self, blocks: list[Runs], f: FloatImage, deformed: FloatImage
-    ) -> FloatArray:
+    def _block_gradients(self, blocks: list[Runs], f: FloatImage, g: FloatImage) -> FloatArray:
         """(blocks, n): the derivative of each block's share of the cost."""
-        a, g = self.result.unknowns, SplineImage.of(deformed, self.result.order)
+        a, spline = self.result.unknowns, SplineImage.of(g, self.result.order)
         every = Assembly(self.result.ansatz, self.result.grid, self.used)
-        return np.array([every.images(a, f, g, False, runs=part).gradient for part in blocks])
+        return np.array([every.images(a, f, spline, False, runs=part).gradient for part in blocks])
 
 
 def _sandwich(inverse: FloatArray, gradients: FloatArray) -> FloatArray:
