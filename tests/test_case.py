@@ -87,7 +87,7 @@ def test_plain_values_make_the_same_case_again() -> None:
         ('[experiment.specimen]\nholes_x = "six"', "'six'"),
         ("[experiment.specimen]\nbulk_x = -1.0", "bulk edges of 0 mm or more"),
         ("[experiment]\nstrains = [0.1, 0.05]", "ascending"),
-        ("[experiment]\nstrains = [12.8]", "less than 0.5"),
+        ("[experiment]\nstrains = [12.8]", "below 0.5"),
         ('[experiment]\nedges = "glued"', "'glued'"),
         ("[correlation]\norder = 4", "order 3, 5 or 11"),
         ("[imaging]\npixel_size = 0", "pixel size [mm] above 0"),

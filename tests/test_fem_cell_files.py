@@ -232,7 +232,7 @@ def test_bad_meshes_are_refused_in_one_line(
     ("text", "message"),
     [
         ("nonsense(", "a file that gmsh reads"),
-        ("Point(1) = {0, 0, 0};", "got no elements"),
+        ("Point(1) = {0, 0, 0};", "expected a surface, got none"),
         (HOLE.format(width=2, radius=1.0), "periodic cell: expected a partner"),
         (HOLE.format(width=1.5, radius=0.95), "periodic cell: expected a partner"),
         # A hole drawn across another: the curves of a plane surface must not cross.

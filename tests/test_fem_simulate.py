@@ -243,7 +243,7 @@ def test_info_tells_how_it_came_about() -> None:
         ({"strains": (0.1, 0.1)}, "ascending positive"),
         ({"strains": (-0.1,)}, "ascending positive"),
         ({"strains": (float("nan"),)}, "ascending positive"),
-        ({"strains": (7.8, 12.8)}, r"less than 0.5 \(0.128 is 12.8 %\), got 12.8"),
+        ({"strains": (7.8, 12.8)}, r"below 0.5 \(0.128 is 12.8 %\), got 12.8"),
         ({"branches": ("up",)}, "branches: expected some of"),
         ({"branches": ()}, "branches: expected some of"),
         ({"edges": "free"}, "'clamped' or 'sliding', got 'free'"),
