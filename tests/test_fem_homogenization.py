@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import gmsh
 import meshio
@@ -496,6 +498,9 @@ def test_bodies_and_loadings_that_will_not_do_are_refused() -> None:
         HomogenizedPath(two_points)
     with pytest.raises(InputError, match="as many modes"):
         HomogenizedBody(square_one, [rve(), RVE(cell(), Ogden())], LOOSE)
+    five: Any = SimpleNamespace(size=5, rank=0)
+    with pytest.raises(InputError, match="at most 4 ranks, one an RVE, got 5"):
+        HomogenizedBody(square_one, rve(), LOOSE, comm=five)
     two = rectangle_mesh([0, 1, 2], [0, 1])
     with pytest.raises(InputError, match="material of the bulk"):
         HomogenizedBody(two, rve(), LOOSE, is_lattice=np.array([True, False]))

@@ -1,10 +1,11 @@
-"""Several MPI ranks find what one does: the factor in substructures, a specimen, an RVE's modes.
+"""Several MPI ranks find what one does: the factor in substructures, specimens, homogenized too.
 
 Both or all three start once, for Python and dolfinx take them longer than all they have to do.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -14,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -21,12 +23,16 @@ from petsc4py import PETSc
 from test_fem_homogenization import LOOSE, homogeneous
 from test_fem_simulate import by_branch, reference
 from test_fem_stability import compressed, small_structure
+from test_homogenization_run import ONE_ELEMENT, case_of
 
+from modeharvest.cli.root import main
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
+from modeharvest.runs.homogenization.pipeline import HomogenizationRun
+from modeharvest.util.files import read_json
 
 STRAINS = (0.0, 0.15, 0.4)
 PATIENT = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}
@@ -46,6 +52,9 @@ def on_each_rank(folder: Path) -> None:
         assert homogenized.critical is not None
         found["critical"] = homogenized.critical.load
         found["energy"] = homogenized.states[-1].energy
+        sys.argv = ["modeharvest", "homogenize", str(folder / "case.toml"), "--out", str(folder)]
+        with contextlib.suppress(SystemExit):
+            main()
     if rank == 0:
         (folder / "found.json").write_text(json.dumps(found))
 
@@ -76,13 +85,14 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     @cache
     def by(ranks: int) -> tuple[Path, dict[str, Any]]:
         folder = tmp_path_factory.mktemp("ranks")
+        (folder / "case.toml").write_text(ONE_ELEMENT, "utf-8")
         command = ["mpirun", "-n", str(ranks), sys.executable, Path(__file__).name, str(folder)]
         run = subprocess.run(
             command, capture_output=True, text=True, timeout=1800, env=PATIENT, check=False,
             cwd=Path(__file__).parent,
         )  # fmt: skip
         assert run.returncode == 0, run.stderr
-        return folder, json.loads((folder / "found.json").read_text())
+        return folder, json.loads((folder / "found.json").read_text()) | {"said": run.stdout}
 
     return by
 
@@ -122,6 +132,22 @@ def test_two_ranks_homogenize_the_same(found: Found) -> None:
     assert alone.critical is not None
     assert numbers["critical"] == pytest.approx(alone.critical.load, rel=1e-9)
     assert numbers["energy"] == pytest.approx(alone.states[-1].energy, rel=1e-9)
+
+
+@pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
+def test_the_command_shares_rves_out_over_ranks(found: Found, tmp_path: Path) -> None:
+    folder, numbers = found(2)
+    assert numbers["said"].count("A small specimen") == 1, "one rank talks"
+    both = read_json(folder / "summary.json")
+    alone = HomogenizationRun(case_of(tmp_path / "case.toml", ONE_ELEMENT), tmp_path).all()
+    for one, two in ((alone, both), (alone["direct"], both["direct"])):
+        for a, b in zip(one["states"], two["states"], strict=True):
+            assert b["energy_N"] == pytest.approx(a["energy_N"], rel=1e-9)
+    with h5py.File(tmp_path / "rve.h5") as rve, h5py.File(folder / "rve.h5") as shared:
+        for name in ("points", "moduli", "fluctuations"):
+            values = rve[f"states/{name}"][:]
+            off = np.abs(shared[f"states/{name}"][:] - values).max()
+            assert off < 1e-8 * np.abs(values).max()
 
 
 if __name__ == "__main__":

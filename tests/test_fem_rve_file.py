@@ -27,8 +27,9 @@ from modeharvest.validation.homogenization import LatticeMode, MeasuredModes, Mo
 
 FloatArray = NDArray[np.float64]
 PITCH, JUNCTION = 1.9, (0.95, 0.95)
-READER = ROOT / "examples" / "read_rve.py"
-reader = load(READER)
+READER, REBUILDER = (ROOT / "examples" / name for name in ("read_rve.py", "rve_stress.py"))
+reader = sys.modules["read_rve"] = load(READER)
+rebuilder = load(REBUILDER)  # imports the reader that stands beside it
 LAWS = [Ogden((0.9, 0.5), (3.0, -1.5), 5.4), TwoTermI1()]
 
 
@@ -52,32 +53,53 @@ def states(number: int) -> tuple[RVEState, ...]:
 
 def written(path: Path, number: int = 0) -> tuple[dict[str, Any], dict[str, Any]]:
     write_rve(path, rve(number), states(number))
-    arrays, law = reader.read(path)
-    return arrays, law
+    return read(path)
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """All arrays, and the constants of the law."""
+    arrays, attributes = reader.read(path)
+    return arrays, attributes["material/0"]
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_the_reader_rebuilds_mean_stresses(number: int, tmp_path: Path) -> None:
+def test_mean_stresses_are_rebuilt(number: int, tmp_path: Path) -> None:
     file, law = written(tmp_path / "rve.h5", number)
     for q, w, stresses in zip(
         file["states/strains"], file["states/fluctuations"], file["states/stresses"], strict=True
     ):
-        found = reader.mean_stress(file, law, reader.displacement(file, q, w))
+        found = rebuilder.mean_stress(file, law, rebuilder.displacement(file, q, w))
         np.testing.assert_allclose(found.ravel(), stresses[:4], rtol=0, atol=1e-13)
 
 
-def test_the_reader_is_short_and_runs_without_the_program(tmp_path: Path) -> None:
-    written(tmp_path / "rve.h5")
+def test_the_reader_is_short_and_needs_h5py_alone(tmp_path: Path) -> None:
+    file, law = written(tmp_path / "rve.h5")
     lines = READER.read_text("utf-8").splitlines()
+    assert len(lines) <= 30
     assert [line for line in lines if line.startswith(("import", "from"))] == [
-        "import sys", "import h5py", "import numpy as np"
+        "import sys", "import h5py"
     ]  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, READER, tmp_path / "rve.h5"], capture_output=True, text=True, check=True
-    )
-    count, _, off = done.stdout.partition(" states: P rebuilt within ")
+    assert law["kind"] == "Ogden"
+    printed = run(READER, tmp_path / "rve.h5").splitlines()
+    assert len(printed) == len(file)
+    for text in ("nodes", f"{file['nodes'].shape} [mm]: undeformed, from the RVE's centre"):
+        assert text in next(line for line in printed if line.startswith("nodes "))
+
+
+def test_stresses_are_rebuilt_without_the_program(tmp_path: Path) -> None:
+    written(tmp_path / "rve.h5")
+    imported = {"import sys", "import numpy as np", "from read_rve import read"}
+    lines = REBUILDER.read_text("utf-8").splitlines()
+    assert {line for line in lines if line.startswith(("import", "from"))} == imported
+    count, _, off = run(REBUILDER, tmp_path / "rve.h5").partition(" states: P rebuilt within ")
     assert int(count) == 3
     assert float(off.split()[0]) < 1e-13
+
+
+def run(script: Path, file: Path) -> str:
+    """What an example prints in a process of its own."""
+    command = [sys.executable, script, file]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def test_pairs_are_a_lattice_vector_apart(tmp_path: Path) -> None:
@@ -153,7 +175,7 @@ def test_averages_are_integrals_over_the_material(tmp_path: Path) -> None:
 
 
 class Independent:
-    """The RVE of a file by numpy alone: residual by the reader's law, moduli by differences."""
+    """The RVE of a file by numpy alone: residual by the example's law, moduli by differences."""
 
     def __init__(self, file: dict[str, Any], law: dict[str, Any]) -> None:
         self.file, self.law, self.count = file, law, len(file["nodes"])
@@ -175,23 +197,23 @@ class Independent:
         self.C = file["averages"][2:].reshape(-1, 2 * self.count) @ self.T
         none = np.zeros((self.count, 2))
         rest = np.array([1.0, 0, 0, 1.0, 0, 0, 0])
-        columns = [reader.displacement(file, rest + unit, none) for unit in np.eye(7)]
+        columns = [rebuilder.displacement(file, rest + unit, none) for unit in np.eye(7)]
         self.M = np.reshape(columns, (7, -1)).T
 
     def stress(self, u: FloatArray) -> FloatArray:
         H = np.einsum("epky,ekx->epxy", self.grad, u[self.file["cells"]])
-        return np.asarray(reader.stress(np.eye(2) + H, self.law))
+        return np.asarray(rebuilder.stress(np.eye(2) + H, self.law))
 
     def assembled(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         cells = self.file["cells"]
         H = np.einsum("epky,ekx->epxy", self.grad, u[cells])
-        P, h = reader.stress(np.eye(2) + H, self.law), 1e-5
+        P, h = rebuilder.stress(np.eye(2) + H, self.law), 1e-5
         A = np.empty((*P.shape, 2, 2))
         for i in (0, 1):
             for j in (0, 1):
                 dH = np.zeros((2, 2))
                 dH[i, j] = h
-                plus, minus = (reader.stress(np.eye(2) + H + s * dH, self.law) for s in (1, -1))
+                plus, minus = (rebuilder.stress(np.eye(2) + H + s * dH, self.law) for s in (1, -1))
                 A[..., i, j] = (plus - minus) / (2 * h)
         f, K = np.zeros((self.count, 2)), np.zeros((self.count, 2, self.count, 2))
         np.add.at(f, cells, np.einsum("ep,epky,epxy->ekx", self.dA, self.grad, P))
@@ -207,7 +229,7 @@ class Independent:
         for part in np.arange(1, parts + 1) / parts:
             here = rest + part * (q - rest)
             for _ in range(12):
-                u = reader.displacement(self.file, here, (self.T @ w).reshape(-1, 2))
+                u = rebuilder.displacement(self.file, here, (self.T @ w).reshape(-1, 2))
                 f, K = self.assembled(u)
                 saddle = np.block([[self.T.T @ K @ self.T, self.C.T], [self.C, zero]])
                 sides = [-self.T.T @ f, *(-self.T.T @ K @ self.M).T]
@@ -240,7 +262,7 @@ def test_stresses_and_moduli_are_derivatives(tmp_path: Path) -> None:
     pairs = [[element.equilibrium(q + s * h * e) for s in (1, -1)] for e in np.eye(7)]
     around = [state for pair in pairs for state in pair]
     write_rve(tmp_path / "rve.h5", element, [element.equilibrium(q), *around])
-    file, _ = reader.read(tmp_path / "rve.h5")
+    file, _ = read(tmp_path / "rve.h5")
     moduli, stresses, energy = (file[f"states/{n}"] for n in ("moduli", "stresses", "energy"))
     np.testing.assert_allclose((energy[1::2] - energy[2::2]) / (2 * h), stresses[0], atol=1e-10)
     slopes = (stresses[1::2] - stresses[2::2]).T / (2 * h)
@@ -289,7 +311,7 @@ def test_a_measured_mode_has_its_error_bars(tmp_path: Path) -> None:
     mode = known.modes(known.parameters.values)[0].snapped
     element = RVE(square(PITCH, 1.5, 0.5).enlarged(2, 2), Ogden(), [mode], JUNCTION, "given")
     write_rve(tmp_path / "rve.h5", element, measured=known)
-    file, _ = reader.read(tmp_path / "rve.h5")
+    file, _ = read(tmp_path / "rve.h5")
     wave = {name.removeprefix("waves/0/"): a for name, a in file.items() if "waves/0/" in name}
     assert wave["covariance"].shape == (4 * len(wave["vectors"]),) * 2
     angle = file["nodes"] @ wave["vectors"].T
@@ -362,11 +384,11 @@ def test_any_number_of_modes_has_its_place(tmp_path: Path) -> None:
         state = element.equilibrium(element.at_rest * 0.99 + 0.0)
         write_rve(tmp_path / "rve.h5", element, [state])
         write_fe2(tmp_path / "rve.mat", element)
-        file, law = reader.read(tmp_path / "rve.h5")
+        file, law = read(tmp_path / "rve.h5")
         assert file["modes"].shape == (count, len(file["nodes"]), 2)
         assert file["averages"].shape == (2 + 3 * count, len(file["nodes"]), 2)
-        u = reader.displacement(file, file["states/strains"][0], file["states/fluctuations"][0])
-        found = reader.mean_stress(file, law, u).ravel()
+        u = rebuilder.displacement(file, file["states/strains"][0], file["states/fluctuations"][0])
+        found = rebuilder.mean_stress(file, law, u).ravel()
         np.testing.assert_allclose(found, file["states/stresses"][0, :4], atol=1e-13)
         assert scipy.io.loadmat(tmp_path / "rve.mat")["RVEmesh"][0, 0]["phi"].size == count
 

@@ -24,6 +24,7 @@ from modeharvest.report.model import (
     text_of,
 )
 from modeharvest.runs.homogenization.results import HomogenizationData, aligned
+from modeharvest.util.arrays import FloatArray
 
 Summary = Mapping[str, Any]
 
@@ -120,10 +121,10 @@ def findings(summary: Summary) -> list[str]:
     if mode is not None and mode["errors"] is not None:
         change = 100 * max(mode["wave_change"])
         text.append(text_of("homogenized-snapped", change=change, errors=mode["errors"]))
-    amplitude = summary["amplitude"]
-    if amplitude is not None:
-        share = 100 * amplitude["difference_rms_mm"] / amplitude["measured_rms_mm"]
-        text.append(text_of("homogenized-amplitude", share=share, **amplitude))
+    for name in ("displacement", "amplitude"):
+        if (both := summary[name]) is not None:
+            share = 100 * both["difference_rms_mm"] / both["measured_rms_mm"]
+            text.append(text_of(f"homogenized-{name}", share=share, **both))
     text.append(
         f"The specimen is of the {material_text(summary['case']['experiment']['material'])}."
     )
@@ -171,19 +172,30 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
     if data is None or not data.fields.states:
         return []
     state, mesh = data.compared or data.fields.states[-1], data.fields.mesh
-    several = state.amplitudes.shape[1] > 1
+    several, is_lattice = state.amplitudes.shape[1] > 1, np.isfinite(state.amplitudes[:, 0])
     fields = {f"v{k} homogenized" if several else "homogenized": v
               for k, v in enumerate(state.amplitudes.T, start=1)}  # fmt: skip
+    means = dict[str, FloatArray]()
     if data.compared is not None:
-        v, measured = aligned(state.amplitudes[:, 0], data.measured_at(mesh.nodes))
-        fields = {"homogenized": v, "measured in the images": np.where(np.isnan(v), v, measured)}
-    every = np.concatenate([values[np.isfinite(values)] for values in fields.values()])
-    scale = ColourScale.signed(every, "mm")
-    drawn = [
-        ReportFigure(f"amplitude-{k}", label,
-                     partial(figures.draw_amplitude, mesh, state.displacement, values, scale))
-        for k, (label, values) in enumerate(fields.items(), start=1)
-    ]  # fmt: skip
+        measured = np.where(is_lattice[:, None], data.measured_at(mesh.nodes), np.nan)
+        for k, name in enumerate("xy"):
+            u = np.where(is_lattice, state.displacement[:, k], np.nan)
+            means |= {f"u{name} homogenized": u, f"v0{name} measured": measured[:, k]}
+        if not several:
+            names = "homogenized", "measured in the images"
+            both = aligned(state.amplitudes[:, 0], measured[:, 2])
+            fields = dict(zip(names, both, strict=True))
+
+    def drawn(kind: str, fields: dict[str, FloatArray]) -> list[ReportFigure]:
+        every = np.concatenate([values[np.isfinite(values)] for values in fields.values()])
+        scale, how = ColourScale.signed(every, "mm"), figures.draw_amplitude
+        return [
+            ReportFigure(
+                f"{kind}-{k}", label, partial(how, mesh, state.displacement, values, scale)
+            )
+            for k, (label, values) in enumerate(fields.items(), start=1)
+        ]
+
     at, points = f"at {100 * state.load:.4g} %", data.fields.points
     places = [np.argmin(points @ sign) for sign in np.array([(1, 1), (-1, 1), (1, -1), (-1, -1)])]
     rves = [
@@ -193,10 +205,12 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
         )
         for k, n in enumerate(dict.fromkeys(places), start=1)
     ]  # fmt: skip
-    text = (text_of(f"homogenized-{name}") for name in ("fields", "microstructure"))
-    name = f"Amplitudes {at}" if several else f"Amplitude v₁ {at}"
-    return [Card(name, drawn, wide=True, caption=next(text)),
-            Card(f"Microstructure {at}", rves, wide=True, caption=next(text))]  # fmt: skip
+    cards = [("Amplitudes" if several else "Amplitude v₁", drawn("amplitude", fields), "fields")]
+    if means:
+        cards.append(("Mean displacement v₀", drawn("mean", means), "means"))
+    cards.append(("Microstructure", rves, "microstructure"))
+    return [Card(f"{name} {at}", made, wide=True, caption=text_of(f"homogenized-{text}"))
+            for name, made, text in cards]  # fmt: skip
 
 
 def _mode_cards(summary: Summary) -> list[Card]:

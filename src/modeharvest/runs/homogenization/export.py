@@ -1,6 +1,6 @@
 """An RVE for other codes: its mesh, modes, moduli as HDF5, and in the layout of a MATLAB FE2 code.
 
-``examples/read_rve.py`` reads the HDF5 with h5py and numpy; docs/rve.md has its layout.
+``examples/read_rve.py`` reads the HDF5 with h5py alone; docs/rve.md has its layout.
 """
 
 from __future__ import annotations
@@ -70,11 +70,13 @@ def write_rve(
     rve: RVE,
     states: Sequence[RVEState] = (),
     measured: MeasuredModes | None = None,
+    position: tuple[int, int] = (1, 1),
     **of_states: ArrayLike,
 ) -> None:
     """Write an RVE with its modes, and its stresses and moduli at some states, as HDF5.
 
     measured : how the modes, all of them, were measured.
+    position : which one it is, from 1, of how many that stand at each point, whose mean counts.
     of_states : "loads" (k,), "points" (k, 2), "buckled" (k,) of the states, where they are a
         specimen's.
     """
@@ -82,6 +84,7 @@ def write_rve(
     pairs = periodic_pairs(periodicity)
     with atomic_hdf5(path) as file:
         file.attrs.update(format=FORMAT, element=mesh.element, normalisation=rve.normalisation)
+        file.attrs.update(position=position[0], positions=position[1])
         file.attrs["strains"] = _named(m, "F11 F12 F21 F22", "v{}", "dv{}/dx dv{}/dy")
         file.attrs["strain_units"] = _named(m, "- - - -", "mm", "- -")
         file.attrs["stresses"] = _named(m, "P11 P12 P21 P22", "Pi{}", "Lambda{}x Lambda{}y")

@@ -6,7 +6,8 @@
     mode.json                      mode         as it was found, snapped to the lattice, error bars
     homogenized.json               homogenize   critical strain, forces, energies, sensitivities
     homogenized.h5                              the same states as fields
-    rve.h5 rve.mat                              the RVE with modes and moduli, for other codes
+    rve.h5 rve.mat                              the RVE with modes and moduli, for other codes;
+                                                of several positions rve2, rve3, ... too
     report.html summary.json       report       beside the direct simulation
 """
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +52,7 @@ from modeharvest.runs.homogenization.results import (
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, reading, sha256_of, write_json
+from modeharvest.util.machine import on_first
 from modeharvest.util.progress import named
 from modeharvest.util.stages import StagedRun, exclusive, stage_key
 from modeharvest.util.typed import picked, to_plain
@@ -68,6 +70,8 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.cells import UnitCell
     from modeharvest.fem.lattice.micromorphic.branches import Homogenized
     from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
+    from modeharvest.fem.lattice.micromorphic.path import HomogenizedState
+    from modeharvest.fem.lattice.micromorphic.rve import RVEState
 
 _FAR = 3.0
 """Standard deviations by which snapping may change a wave vector without a warning."""
@@ -108,6 +112,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             write_json(path, to_plain(dict(zip(names, self._found_modes(), strict=True))))
             return (path,)
 
+        _ = self.result  # a stage of its own, in which all ranks take part
         self.do("mode", self._mode_key, work)
         with reading(path, "a mode", "remove it"):
             content = read_json(path)
@@ -117,7 +122,10 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             return tuple(found), known, tuple(content["warnings"])
 
     def homogenize(self) -> dict[str, Any]:
-        """Follow the homogenized specimen; leaves ``homogenized.json``, ``.h5``, and its RVE."""
+        """Follow the homogenized specimen; leaves ``homogenized.json``, ``.h5``, and its RVEs.
+
+        Under mpirun the ranks share RVEs out.
+        """
         path, fields = self.folder / "homogenized.json", self.folder / "homogenized.h5"
         modes, parameters, _ = self.mode()
         how = self.case.homogenization
@@ -134,7 +142,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                     partial(self._predicted, what="error bars"),
                 )
             first = self._followed(self._body([]), "first order") if how.first_order else None
-            write_json(path, to_plain({
+            content = to_plain({
                 "response": response,
                 "effects": effects,
                 "criticals": [picked(c, _CRITICAL) for c in found.criticals],
@@ -145,24 +153,25 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                 "first_order_critical_strain": first and first.critical and first.critical.load,
                 "rves": body.point_count * len(body.rves),
                 "linearisations": found.linearisations,
-            }))  # fmt: skip
+            })  # fmt: skip
+            on_first(lambda: write_json(path, content))
             write_fields(found, body, fields)
             errors = None if parameters is None else MeasuredModes(parameters, self._modes_of)
             return path, fields, *self._exported(found, body, errors)
 
-        self.do("homogenize", self._homogenized_key, work)
+        self.do("homogenize", self._homogenized_key, work, collective=True)
         with reading(path, "a homogenized specimen", "remove it"):
             return dict(read_json(path))
 
     def report(self) -> dict[str, Any]:
         """Compare with the direct simulation; leaves ``report.html`` and ``summary.json``."""
         path, page = self.folder / "summary.json", self.folder / "report.html"
+        data = self._data()
 
         def work() -> tuple[Path, ...]:
             from modeharvest.report.homogenization import homogenization_report
             from modeharvest.report.model import write_page
 
-            data = self._data()
             summary = summary_of(self.case.title, self.case.plain(), data)
             write_page(homogenization_report(summary, data), page, self.progress)
             write_json(path, summary)
@@ -179,7 +188,6 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         with exclusive(self.folder):
             if isinstance(self.case.mode, MeasuredMode):
                 self.virtual.all()
-            self.homogenize()
             return self.report()
 
     # -- parts --------------------------------------------------------------------------
@@ -412,25 +420,30 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     def _exported(
         self, found: Homogenized, body: HomogenizedBody, measured: MeasuredModes | None
-    ) -> tuple[Path, Path]:
-        """Write the first RVE at a point, with the state before the critical point, too."""
-        rve, before = body.rves[0], [found.critical.state] if found.critical else []
-        every = sorted([*before, *found.states], key=lambda state: state.load)
-        count, step = len(body.places), len(body.rves)
-        states = [
-            rve.equilibrium(q, rve.cell.reduction.displacement(w))
-            for state in every
-            for q, w in zip(state.strains, body.fluctuations(state.value)[::step], strict=True)
-        ]
-        paths = self.folder / "rve.h5", self.folder / "rve.mat"
-        write_rve(
-            paths[0], rve, states, measured,
-            loads=np.repeat([state.load for state in every], count),
-            points=np.tile(body.places, (len(every), 1)),
-            buckled=np.repeat([int(state.branch != "primary") for state in every], count),
-        )  # fmt: skip
-        write_fe2(paths[1], rve)
-        return paths
+    ) -> list[Path]:
+        """Write the RVE of each position, with the state before the critical point, too."""
+        before = [found.critical.state] if found.critical else []
+        states = sorted([*before, *found.states], key=lambda state: state.load)
+        points, count = len(body.places), len(body.rves)
+        every = [dict(chain(*body.comm.allgather(_own_states(body, s)))) for s in states]
+        of_states = {
+            "loads": np.repeat([s.load for s in states], points),
+            "points": np.tile(body.places, (len(states), 1)),
+            "buckled": np.repeat([int(s.branch != "primary") for s in states], points),
+        }
+
+        def write() -> list[Path]:
+            paths = []
+            for k, rve in enumerate(body.rves):
+                own = [at[k + count * point] for at in every for point in range(points)]
+                name = f"rve{k + 1 if k else ''}"
+                h5, mat = (self.folder / f"{name}.{kind}" for kind in ("h5", "mat"))
+                write_rve(h5, rve, own, measured, (k + 1, count), **of_states)
+                write_fe2(mat, rve)
+                paths += [h5, mat]
+            return paths
+
+        return on_first(write)
 
     def _predicted(self, modes: Sequence[LatticeMode], what: str) -> Response:
         return response_of(self._followed(self._body([mode.snapped for mode in modes]), what))
@@ -440,7 +453,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         found, (modes, parameters, warnings) = self.homogenize(), self.mode()
         fields = HomogenizedFields.read(self.folder / "homogenized.h5")
         solution = self.virtual.fem() if self.case.is_experiment else None
-        is_compared = isinstance(self.case.mode, MeasuredMode) and len(modes) == 1 and solution
+        is_compared = isinstance(self.case.mode, MeasuredMode) and solution
         return HomogenizationData(
             found=found,
             direct=Response(None, ()) if solution is None else direct_response(solution),
@@ -453,3 +466,12 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             measured_strain=self._measured_strain,
             command=f"modeharvest homogenize {self.source} --out {self.folder}",
         )
+
+
+def _own_states(body: HomogenizedBody, state: HomogenizedState) -> list[tuple[int, RVEState]]:
+    """Those of this rank's RVEs in a state, with the RVEs' numbers."""
+    return [
+        (int(k), rve.equilibrium(q, rve.cell.reduction.displacement(w)))
+        for k, w in zip(body.own, body.fluctuations(state.value), strict=True)
+        for rve, q in [(body.rve(k), state.strains[k // len(body.rves)])]
+    ]

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from modeharvest.fem.field import Mesh, read_values, write_values
+from modeharvest.fem.lattice.micromorphic.mesh import quadrature
 from modeharvest.idic.result import Result
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import atomic_hdf5, open_hdf5
+from modeharvest.util.machine import on_first
 from modeharvest.util.stages import versions
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.homogenization import (
@@ -29,8 +31,6 @@ if TYPE_CHECKING:
 FORMAT = "modeharvest-homogenized-1"
 _QUARTERS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
 """Signs of x and y."""
-_V = 4
-"""Where v1 is among the generalised strains."""
 _REVERSED = [0, 3, 2, 1, 7, 6, 5, 4]
 """The nodes of a Q8 element the other way round."""
 
@@ -56,21 +56,26 @@ def write_fields(found: Homogenized, body: HomogenizedBody, path: Path) -> None:
 
     Of a quarter its mirror images are written too; its points stay those of the quarter.
     """
-    signs = _QUARTERS[: body.copies]
-    with atomic_hdf5(path) as file:
-        file.attrs.update(format=FORMAT, copies=body.copies)
-        write_values(file.create_group("mesh"), _unfolded(body.mesh, signs))
-        write_values(file.create_group("rve"), body.rves[0].cell.cell.mesh)
-        file["points"] = body.places
-        for k, state in enumerate(found.states):
-            u = np.concatenate([state.displacement * sign for sign in signs])
-            v = np.tile(state.amplitudes, (len(signs), 1))
-            micro = np.stack([
-                body.microstructure(state.value, state.strains, number)
-                for number in range(0, len(body.places) * len(body.rves), len(body.rves))
-            ])  # fmt: skip
-            fields = StateFields(state.load, u, v, state.strains, state.stresses, micro)
-            write_values(file.create_group(f"states/{k:03d}"), fields)
+    signs, every, count = _QUARTERS[: body.copies], list[StateFields](), len(body.rves)
+    for state in found.states:  # on all ranks, each of which has some of the RVEs
+        u = np.concatenate([state.displacement * sign for sign in signs])
+        v = np.tile(state.amplitudes, (len(signs), 1))
+        micro = np.stack([
+            body.microstructure(state.value, state.strains, number)
+            for number in range(0, len(body.places) * count, count)
+        ])  # fmt: skip
+        every.append(StateFields(state.load, u, v, state.strains, state.stresses, micro))
+
+    def write() -> None:
+        with atomic_hdf5(path) as file:
+            file.attrs.update(format=FORMAT, copies=body.copies)
+            write_values(file.create_group("mesh"), _unfolded(body.mesh, signs))
+            write_values(file.create_group("rve"), body.rves[0].cell.cell.mesh)
+            file["points"] = body.places
+            for k, fields in enumerate(every):
+                write_values(file.create_group(f"states/{k:03d}"), fields)
+
+    on_first(write)
 
 
 def _unfolded(mesh: Mesh, signs: FloatArray) -> Mesh:
@@ -146,10 +151,10 @@ class HomogenizationData:
         return near[0] if near and self.measured is not None else None
 
     def measured_at(self, points: FloatArray) -> FloatArray:
-        """(n,) v1 as it was measured, at points (n, 2) [mm]."""
+        """(n, 3) v0 and v1 as they were measured, at points (n, 2) [mm]."""
         assert self.measured is not None
-        x, y = points.T[..., None]
-        return self.measured.ansatz.v(0, self.measured.unknowns, x, y)[:, 0]
+        (x, y), a, of = points.T[..., None], self.measured.unknowns, self.measured.ansatz
+        return np.hstack([of.v0(a, x, y)[:, 0], of.v(0, a, x, y)])
 
 
 def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) -> dict[str, Any]:
@@ -175,7 +180,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
             "errors": _errors(data.parameters),
         }) if modes else None,
         "sensitivities": found["effects"],
-        "amplitude": _amplitude(data),
+        **_compared(data),
         "warnings": list(data.warnings),
         "rves": found["rves"],
         "linearisations": found["linearisations"],
@@ -183,6 +188,8 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
             "homogenized.h5": "mesh and states: u, v_i, generalised strains, stresses, RVEs (HDF5)",
             "rve.h5": "the RVE for other codes: mesh, pairs, modes, moduli (HDF5)",
             "rve.mat": "the same mesh, pairs and modes in the layout of a MATLAB FE2 code",
+            **{f"rve{k}.{kind}": f"the same of position {k}" for kind in ("h5", "mat")
+               for k in range(2, case["homogenization"]["positions"] ** 2 + 1)},
             "homogenized.json": "critical strain, forces, energies, sensitivities",
             "mode.json": "the modes as they were measured and snapped, with their covariances",
             "experiment/": "the virtual experiment: simulation, images, what was measured in them",
@@ -198,26 +205,34 @@ def _errors(parameters: ModeParameters | None) -> str | None:
     return "noise" if parameters.by_model_error is None else "model error"
 
 
-def _amplitude(data: HomogenizationData) -> dict[str, float] | None:
-    """Rms over the lattice of v1 homogenized, measured, and of their difference [mm].
+def _compared(data: HomogenizationData) -> dict[str, dict[str, float] | None]:
+    """Of u with v0, and of v1 with v1: rms homogenized, measured, of their difference [mm].
 
-    Over the quadrature points, of a quarter's mirror images too, which stand for areas alike.
+    Over the lattice; of v0 that of its length. Of several modes v1 isn't compared: which one is
+    strongest, and their signs, are those of one branch of several that are alike.
     """
-    state, points = data.compared, data.fields.points
+    state, mesh = data.compared, data.fields.mesh
+    found: dict[str, dict[str, float] | None] = {"displacement": None, "amplitude": None}
     if state is None:
-        return None
-    signs = _QUARTERS[: data.fields.copies]
-    measured = np.concatenate([data.measured_at(points * sign) for sign in signs])
-    v = np.tile(state.strains[:, _V], len(signs))
-    homogenized, measured = aligned(v, measured)
-    difference = homogenized - measured
-    values = {"homogenized": homogenized, "measured": measured, "difference": difference}
-    rms = {f"{name}_rms_mm": float(np.sqrt(np.mean(v**2))) for name, v in values.items()}
-    return {"nominal_strain": state.load} | rms
+        return found
+    cells = mesh.cells[np.isfinite(state.amplitudes[:, 0][mesh.cells]).all(axis=1)]
+    at = quadrature(Mesh(mesh.nodes, cells, mesh.element), 3)
+    nodal = np.hstack([state.displacement, state.amplitudes])[cells]
+    homogenized = np.einsum("pk,ckf->cpf", at.shapes, nodal).reshape(-1, nodal.shape[-1])
+    measured, weights = data.measured_at(at.places.reshape(-1, 2)), at.weights.ravel()
+    parts = {"displacement": (homogenized[:, :2], measured[:, :2])}
+    if len(data.modes) == 1:
+        parts["amplitude"] = aligned(homogenized[:, 2:], measured[:, 2:])
+    for name, (ours, theirs) in parts.items():
+        values = {"homogenized": ours, "measured": theirs, "difference": ours - theirs}
+        rms = {f"{k}_rms_mm": float(np.sqrt(np.average(np.sum(v**2, axis=1), weights=weights)))
+               for k, v in values.items()}  # fmt: skip
+        found[name] = {"nominal_strain": state.load} | rms
+    return found
 
 
 def aligned(homogenized: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two amplitude fields (n,), the first with the sign of the second where both are known.
+    """Amplitude fields, alike in shape, the first with the sign of the second where both are known.
 
     A pattern and its mirror image are one buckled state.
     """
