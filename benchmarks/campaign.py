@@ -89,12 +89,12 @@ def speedup(guesses: int, pixel: float, folder: Path) -> None:
     path, case = shipped_solution("paper-virtual"), StudyCase()
     assert path is not None, "the case ships its solution"
     imaging = replace(case.imaging, pixel_size=pixel)
-    subject = ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
+    spec = ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
     study = RobustnessStudy(initial_guesses=guesses, radii=(), strain_errors=())
     found = {}
     for workers in (1, 2, 2, 1):  # so that a drift of the machine hits both alike
         own = folder / f"{workers}-{len(found)}-{time.perf_counter_ns()}"
-        cases = study.prepare(subject, own)
+        cases = study.prepare(spec, own)
         timing = alone(study.function, cases, own, workers)
         found.setdefault(workers, []).append(timing)
         print(f"{workers} worker{'s' * (workers > 1)}: {timing.whole:.1f} s, "

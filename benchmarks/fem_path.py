@@ -185,8 +185,8 @@ def row(name: str, material: Material, size: float) -> str:
 def wall(ranks: int, size: float) -> tuple[float, str]:
     """Wall time of ``simulate`` on some ranks [s], after their start, and the critical strain."""
     command = ["mpirun", "-n", str(ranks), sys.executable, __file__, "--one", str(size)]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-    return float(said[0]), said[1]
+    message = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    return float(message[0]), message[1]
 
 
 def one(size: float) -> None:

@@ -110,17 +110,17 @@ def square_rule(aperture: Aperture, side: int) -> tuple[FloatArray, FloatArray]:
 
 
 def aperture_errors(
-    scene: ImagedState, aperture: Aperture, fine: int = 16, finest: int = 1597
+    imaged: ImagedState, aperture: Aperture, fine: int = 16, finest: int = 1597
 ) -> tuple[int, dict[str, FloatArray]]:
     """Points a pixel, and the errors of single pixels, by where these lie.
 
     They are compared with a rule of ``fine`` points a side; at the edges of holes, where a rule
     for smooth functions is no help, with ``finest`` evenly scattered points.
     """
-    assert scene.displacement is not None
-    mesh, grid = scene.mesh, scene.grid
-    located = locate(mesh.nodes + scene.displacement, mesh.cells, mesh.element, grid)
-    image, how = integrate(scene, aperture, located.mask)
+    assert imaged.displacement is not None
+    mesh, grid = imaged.mesh, imaged.grid
+    located = locate(mesh.nodes + imaged.displacement, mesh.cells, mesh.element, grid)
+    image, how = integrate(imaged, aperture, located.mask)
     near = near_edges(located.mask, aperture.reach_px)
     size = 2 * aperture.reach_px + 1
     one_element = ndimage.maximum_filter(located.element, size) == ndimage.minimum_filter(
@@ -135,7 +135,7 @@ def aperture_errors(
         "at a hole's edge": (near, even),
     }  # fmt: skip
     errors = {
-        name: image[where] - scene.average(*rule, where) for name, (where, rule) in groups.items()
+        name: image[where] - imaged.average(*rule, where) for name, (where, rule) in groups.items()
     }
     return how.points, errors
 
@@ -159,11 +159,11 @@ def main() -> None:
     print(f"| points, {POINTS} random pixels | largest difference [of full scale] |\n|---|---|")
     for what, error in point_errors(mesh, u, WINDOW, speckle, POINTS).items():
         print(f"| {what} | {error:.1e} |")
-    scene = ImagedState(mesh, u, WINDOW, speckle, 0.0)
+    imaged = ImagedState(mesh, u, WINDOW, speckle, 0.0)
     print("\n| averages over pixels | points/px | where | pixels | rms error | largest |")
     print("|---|---|---|---|---|---|")
     for aperture in (Aperture(1.0), Aperture(0.8, 0.5)):
-        points, errors = aperture_errors(scene, aperture)
+        points, errors = aperture_errors(imaged, aperture)
         name = f"fill factor {aperture.fill_factor:g}, point spread {aperture.psf_px:g} px"
         for where, e in errors.items():
             rms, largest = float(np.sqrt((e**2).mean())), float(np.abs(e).max())

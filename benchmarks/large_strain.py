@@ -35,7 +35,7 @@ PITCH, PIXEL = 1.9, 0.03
 CELLULAR, DOMAIN = Box.centred(4 * PITCH, 4 * PITCH), Box.centred(4 * PITCH + 1.6, 4 * PITCH + 1.6)
 HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, PITCH / 2))
 ANSATZ = Ansatz.on(DOMAIN, [(square_family("junction"), CELLULAR)], PITCH)
-SCENE = Photographed(PixelGrid.centred(360, 640, PIXEL), DOMAIN, HOLES, 1.3)
+PHOTOGRAPHED = Photographed(PixelGrid.centred(360, 640, PIXEL), DOMAIN, HOLES, 1.3)
 W_PX, PATTERN = 1.5, 3.0
 """Amplitudes of w and of v1 [mm] at a strain of 1."""
 
@@ -51,7 +51,7 @@ def truth(strain: float, points: FloatArray) -> FloatArray:
 
 def largest_strain(strain: float) -> float:
     """Largest stretch of the reference's material less 1 [-]."""
-    points, h = SCENE.points[SCENE.mask], 1e-4
+    points, h = PHOTOGRAPHED.points[PHOTOGRAPHED.mask], 1e-4
     along = [(truth(strain, points + d) - truth(strain, points - d)) / (2 * h)
              for d in h * np.eye(2)]  # fmt: skip
     F = np.eye(2) + np.stack(along, axis=-1)
@@ -68,7 +68,7 @@ def main() -> None:
     states = {f"frame_{100 * e:03.0f}": float(e) for e in strains}
     shutil.rmtree(given.out, ignore_errors=True)
     given.out.mkdir(parents=True)
-    SCENE.save(given.out, {n: lambda p, e=e: truth(e, p) for n, e in states.items()})
+    PHOTOGRAPHED.save(given.out, {n: lambda p, e=e: truth(e, p) for n, e in states.items()})
     print(
         "formulation  strain  largest  outcome        ansatz   refit  whole: rms  longest  covered"
     )
@@ -88,9 +88,9 @@ def main() -> None:
             if name not in found:
                 print(f"{head}  {failed[name]}")
                 continue
-            result, whole, mask = found[name].result, found[name].whole, SCENE.mask
-            true = truth(strain, SCENE.points)
-            best = fit_displacement(true, SCENE.grid, result.ansatz, result.unknowns, mask)
+            result, whole, mask = found[name].result, found[name].whole, PHOTOGRAPHED.mask
+            true = truth(strain, PHOTOGRAPHED.points)
+            best = fit_displacement(true, PHOTOGRAPHED.grid, result.ansatz, result.unknowns, mask)
             off = rms((result.displacement() - best.displacement())[mask]) / PIXEL
             line = f"{head}  {result.outcome.value:13} {off:7.3f}"
             if whole is not None:

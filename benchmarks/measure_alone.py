@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from large_strain import SCENE
+from large_strain import PHOTOGRAPHED
 from large_strain import truth as stretched
 
 from modeharvest.fem.experiment import Experiment
@@ -117,11 +117,11 @@ def _inside(points: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 def stretch(folder: Path, strains: Sequence[float]) -> Images:
     """A sequence of 4 x 4 holes that is stretched, with pattern and w (large_strain.py)."""
-    images = [SCENE.image(None) / 255.0]
+    images = [PHOTOGRAPHED.image(None) / 255.0]
     for n, strain in enumerate(strains):
-        images.append(SCENE.image(lambda p, e=strain: stretched(e, p), n + 1) / 255.0)
-    u = stretched(strains[-1], SCENE.points) / SCENE.grid.pixel_size
-    return images, SCENE.mask, u
+        images.append(PHOTOGRAPHED.image(lambda p, e=strain: stretched(e, p), n + 1) / 255.0)
+    u = stretched(strains[-1], PHOTOGRAPHED.points) / PHOTOGRAPHED.grid.pixel_size
+    return images, PHOTOGRAPHED.mask, u
 
 
 CASES: dict[str, Callable[[Path], Images]] = {

@@ -6,7 +6,7 @@ and both ways, and stretch by 0 ... 1 %; noise is in both images or in one; spec
 wide; polynomials are of degree 1 to 5. Each realisation of the noise comes as n and as -n: the
 mean of the two errors shows a bias long before it would show out of the scatter.
 
-The truth is in the ansatz, so that nothing is left over but noise. The Cramer-Rao bound is made of
+The truth is in the ansatz, so that noise is all there is. The Cramer-Rao bound is made of
 the pattern's exact gradient. What a few realisations say of scatter is mostly chance; so errors
 are set against those that the efficient linear estimator makes under the very same noise, which
 are at the bound on average: I^-1 (sum J n_f over the pixels of f - sum J n_g/det F over those of

@@ -225,12 +225,12 @@ def covered(result: NodalResult, error: NDArray[Any], regions: Regions) -> dict[
 def show(row: Row) -> None:
     """Print a line of the table."""
     share = "" if row.contradicted is None else f"{100 * row.contradicted:.1f} %"
-    said = f"{row.law} {share}{'*' if row.noticed else ''}"
+    law = f"{row.law} {share}{'*' if row.noticed else ''}"
     print(
         f"{row.noise:5.3f} {row.seed:4d} {row.cutoff_px:8.1f} {row.all:7.4f} {row.edges:7.4f} "
         f"{row.ligaments:7.4f} {row.bulk:7.4f} {row.longest:7.3f} {row.refit:7.4f}  "
         f"{row.covered['all']:8.3f} {row.covered['edges']:8.3f}     "
-        f"{row.seconds:6.1f} ({row.cpu_seconds:.1f}) {row.gigabytes:6.2f} {row.unknowns:8d} {said}",
+        f"{row.seconds:6.1f} ({row.cpu_seconds:.1f}) {row.gigabytes:6.2f} {row.unknowns:8d} {law}",
         flush=True,
     )
 

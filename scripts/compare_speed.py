@@ -61,12 +61,12 @@ class Checkout:
             env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
         assert process.stdout is not None
-        said = process.stdout.read().decode(errors="replace")
+        message = process.stdout.read().decode(errors="replace")
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             what = f"{' '.join(words)} ended with {process.returncode}"
-            raise SystemExit(f"{self.path}: {what}\n{said}")
+            raise SystemExit(f"{self.path}: {what}\n{message}")
         return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0
 
 

@@ -7,7 +7,7 @@ Each line of stdin is a JSON list [WAYS, OUT, COMMAND]. ``WAYS`` is a list of [f
     [FOLDER, "disk", BYTES, STEP]   on a disk of BYTES, and STEP more each time
 
 ``OUT`` is what the command, a list of words, leaves there. Prints a JSON object for each attempt:
-``folder``, ``code``, its exit code or minus the signal that ended it, ``said``, what it wrote to
+``folder``, ``code``, its exit code or minus the signal that ended it, ``message``, what it wrote to
 stderr, and ``files``, the digests of what is there afterwards; and after the last one an exit code.
 
 Each attempt is a fork of this process, which has imported what takes long and computed nothing.
@@ -111,11 +111,11 @@ def attempt(command: list[str], out: Path, prepare: Callable[[], None]) -> int:
     """Run the command once in a fork, and print what became of it."""
     from modeharvest.cli.root import main
 
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as message:
         child = os.fork()
         if child == 0:
             signal.alarm(_LONGEST_S)  # ends what hangs
-            os.dup2(said.fileno(), 2)
+            os.dup2(message.fileno(), 2)
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             sys.argv = ["modeharvest", *command]
             prepare()
@@ -128,9 +128,9 @@ def attempt(command: list[str], out: Path, prepare: Callable[[], None]) -> int:
                 sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
             os._exit(1)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        said.seek(0)
-        text = said.read().decode()
-    made = {"folder": os.getcwd(), "code": code, "said": text, "files": digests(out)}
+        message.seek(0)
+        text = message.read().decode()
+    made = {"folder": os.getcwd(), "code": code, "message": text, "files": digests(out)}
     print(json.dumps(made), flush=True)
     return code
 

@@ -41,7 +41,7 @@ def many(m: int, n: int) -> tuple[tuple[float, float], ...]:
 
 
 def corners(m: int, n: int) -> tuple[tuple[float, float], ...]:
-    """The same with a hole in each corner, cut by the outline."""
+    """The same with a hole in each corner, cut by the boundary."""
     return tuple((i / m, j / n) for i in range(m + 1) for j in range(n + 1))
 
 

@@ -55,7 +55,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (b"title = '\xe9'", "expected UTF-8, as TOML has to be, got a byte 0xe9 in line 1"),
         (b"a = " + b"[" * 20_000, "recursion"),
@@ -83,13 +83,13 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_value_that_means_nothing_is_refused(
-    text: str | bytes, said: str, tmp_path: Path
+    text: str | bytes, message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "case.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError) as caught:
         Case.read(path)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -146,7 +146,7 @@ def test_a_container_may_have_less_than_its_machine(
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "message"),
     [
         ("pixel_size = 1e-9", "enlarge pixel_size"),
         ("pixel_size = 1e-300", "enlarge pixel_size"),
@@ -160,13 +160,13 @@ def test_a_container_may_have_less_than_its_machine(
 )
 def test_images_that_do_not_fit_are_refused_before_they_are_made(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path,
-    tmp_path: Path, table: str, said: str,
+    tmp_path: Path, table: str, message: str,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(place)
     (tmp_path / "case.toml").write_text(f"{SPECIMEN}[imaging]\n{table}\n")
     call = ("image", tmp_path / "case.toml", "--solution", "solution.h5", "--out", tmp_path / "out")
     assert called(monkeypatch, *call) == 2
-    assert said in error_line(capsys)
+    assert message in error_line(capsys)
 
 
 @pytest.mark.dolfinx
@@ -261,7 +261,7 @@ def test_a_bad_call_is_reported_in_one_line(
     ],
 )
 @pytest.mark.parametrize(
-    ("folder", "said"),
+    ("folder", "message"),
     [
         ("file", "expected a folder at file, found a file; remove it, or take another folder"),
         ("file/below", "expected a folder at file, found a file; remove it"),
@@ -270,14 +270,14 @@ def test_a_bad_call_is_reported_in_one_line(
 )
 def test_a_file_or_nothing_is_no_folder_to_write_to(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path,
-    call: str, folder: str, said: str,
+    call: str, folder: str, message: str,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(place)
     before = sorted(place.rglob("*"))
     words = call.split()
     option = () if words[-1].startswith("--") else ("--out",)
     assert called(monkeypatch, *words, *option, folder) == 2
-    assert said in error_line(capsys)
+    assert message in error_line(capsys)
     assert sorted(place.rglob("*")) == before
 
 
@@ -319,7 +319,7 @@ def test_a_bad_experiment_is_reported_in_one_line(
 
 
 @pytest.mark.parametrize(
-    ("polygon", "said"),
+    ("polygon", "message"),
     [
         ("[[1, 1], [50, 40]]", "at least three corners [column, row], got 2"),
         ("[[1, 1], [1, 1], [1, 1]]", "with an area, got 3 corners on one line"),
@@ -327,12 +327,12 @@ def test_a_bad_experiment_is_reported_in_one_line(
     ],
 )
 @pytest.mark.parametrize("table", ["polygon", "[[specimen.regions]]\nname = 'a'\npolygon"])
-def test_a_polygon_has_an_area(table: str, polygon: str, said: str, tmp_path: Path) -> None:
+def test_a_polygon_has_an_area(table: str, polygon: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "experiment.toml"
     path.write_text(f"{HARVEST}{table} = {polygon}\n")
     with pytest.raises(InputError, match="polygon") as caught:
         PhotographCase.read(path)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_wildcards_may_be_absolute(place: Path, tmp_path: Path) -> None:
@@ -383,7 +383,7 @@ def test_names_that_look_like_markup_or_formulas_are_scored(
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "said"),
+    ("error", "code", "message"),
     [
         (MemoryError(), 2, "error: the memory is full"),
         (OSError(28, "No space left on device", "out/x"), 2, "refuses: out/x: No space left"),
@@ -396,7 +396,7 @@ def test_names_that_look_like_markup_or_formulas_are_scored(
 )
 def test_whatever_ends_a_command_is_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path,
-    error: BaseException, code: int, said: str,
+    error: BaseException, code: int, message: str,
 ) -> None:  # fmt: skip
     def fail(name: str) -> str:
         raise error
@@ -405,7 +405,7 @@ def test_whatever_ends_a_command_is_reported_in_one_line(
     monkeypatch.setattr("modeharvest.runs.case.case_text", fail)
     assert called(monkeypatch, "cases", "paper-virtual") == code
     text = capsys.readouterr().err
-    assert said in text
+    assert message in text
     assert text.count("\n") == 1
     logs = list(tmp_path.glob("*.log"))
     assert len(logs) == (code == 70)
@@ -429,7 +429,7 @@ def run(
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 @pytest.mark.parametrize(
-    ("tail", "code", "said"),
+    ("tail", "code", "message"),
     [
         ("cases paper-virtual > /dev/full", 2, "No space left"),
         ("--version > /dev/full", 2, "No space left"),
@@ -439,11 +439,11 @@ def run(
         ("--version 2> /dev/full > /dev/full", 2, ""),
     ],
 )
-def test_a_full_or_closed_terminal_is_no_fault(tail: str, code: int, said: str) -> None:
+def test_a_full_or_closed_terminal_is_no_fault(tail: str, code: int, message: str) -> None:
     done = run("-m modeharvest", tail=tail)
     assert done.returncode == code
-    assert said in done.stderr
-    assert done.stderr.count("\n") == bool(said)
+    assert message in done.stderr
+    assert done.stderr.count("\n") == bool(message)
 
 
 class Swallows:

@@ -93,9 +93,9 @@ def test_the_command_says_what_is_where(
     with pytest.raises(SystemExit) as end:
         main()
     assert not end.value.code
-    said = capsys.readouterr().out
-    assert f"benchmark {BenchmarkTruth.read(truth).id}: 1 deformed images in {public}" in said
-    assert f"truth, not to be given away: {truth}" in said
+    message = capsys.readouterr().out
+    assert f"benchmark {BenchmarkTruth.read(truth).id}: 1 deformed images in {public}" in message
+    assert f"truth, not to be given away: {truth}" in message
 
 
 def test_making_it_again_changes_nothing(copies: tuple[Path, Path]) -> None:
@@ -159,7 +159,7 @@ def test_the_truth_of_an_affine_field_is_exact_anywhere(both: tuple[Path, Path])
     u = displacement_at(made.solution(made.affine), STRAIN, truth.grid, x, y)
     known = np.isfinite(u).all(axis=1)
     hole = np.hypot(np.mod(x, 1.9) - 0.95, np.mod(y + 0.95, 1.9) - 0.95)
-    assert not known[hole < 0.74].any()  # the outline of a hole is a parabola per element
+    assert not known[hole < 0.74].any()  # the boundary of a hole is a parabola per element
     assert known[hole > 0.76].all()
     # Local coordinates are known to about 1e-12 of an element.
     np.testing.assert_allclose(u[known], made.affine(x, y)[known], atol=1e-11)

@@ -114,7 +114,7 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
         elsewhere.require_ready("no_such:f", tmp_path)
 
     # Of another version, or where the folder is not.
-    for said, message in (
+    for answer, message in (
         (
             ("0.0.1", source_digest(), True),
             r"expected modeharvest .*, got 0\.0\.1 .*on the one at tcp",
@@ -122,7 +122,7 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
         ((__version__, "0" * 64, True), r"expected modeharvest .*, got .* with 0{12} on the one"),
         ((__version__, source_digest(), False), "expected workers that can write to the folder"),
     ):
-        monkeypatch.setattr(workers, "handshake", lambda function, mark, said=said: said)
+        monkeypatch.setattr(workers, "handshake", lambda function, mark, answer=answer: answer)
         with pytest.raises(InputError, match=message):
             elsewhere.require_ready("campaign_cases:square", tmp_path)
     monkeypatch.undo()

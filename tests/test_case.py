@@ -74,7 +74,7 @@ def test_plain_values_make_the_same_case_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("[experiment.specimen]\ndiametre = 1.0", "did you mean 'diameter'?"),
         ("[experiment]\nmesh_sise = 0.1", "did you mean 'mesh_size'?"),
@@ -94,11 +94,11 @@ def test_plain_values_make_the_same_case_again() -> None:
         ("[experiment", "not valid TOML"),
     ],
 )
-def test_a_wrong_case_is_reported_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_case_is_reported_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     with pytest.raises(InputError) as caught:
         Case.read(written(tmp_path, text))
     message = str(caught.value)
-    assert said in message
+    assert expected in message
     assert "\n" not in message
     assert "case.toml" in message
 
@@ -126,7 +126,7 @@ def test_a_missing_file_is_named_and_what_it_could_begin_as(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         (
             "[imaging.distortion]\nk9 = 1.0",
@@ -140,8 +140,8 @@ def test_a_missing_file_is_named_and_what_it_could_begin_as(
         ("[experiment]\ntilt = 5.0", "tilt: expected at most 1.0 rad"),
     ],
 )
-def test_what_a_twin_has_is_checked_too(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_what_a_twin_has_is_checked_too(tmp_path: Path, text: str, expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
         Case.read(written(tmp_path, text))
 
 

@@ -44,6 +44,6 @@ def test_a_specimen_that_overlaps_itself_is_reported(
     with pytest.raises(SystemExit) as end:
         main()
     assert not end.value.code
-    said = " ".join(capsys.readouterr().err.split())
-    assert ("warning:" in said) == overlaps
-    assert ("deformed_0500.tif" in said and "more than one element" in said) == overlaps
+    message = " ".join(capsys.readouterr().err.split())
+    assert ("warning:" in message) == overlaps
+    assert ("deformed_0500.tif" in message and "more than one element" in message) == overlaps

@@ -11,22 +11,22 @@ from modeharvest.cli.messages import compilation_announced
 
 
 def test_compilation_is_announced_once() -> None:
-    said = io.StringIO()
+    message = io.StringIO()
     first, second = (numba.njit(lambda x, k=k: x + k) for k in (1, 2))
-    with compilation_announced(Console(file=said, width=200)):
+    with compilation_announced(Console(file=message, width=200)):
         assert first(1) == 2
         assert second(1) == 3
         assert first(1) == 2  # compiled already
-    assert said.getvalue().count("compiling kernels") == 1
+    assert message.getvalue().count("compiling kernels") == 1
     third = numba.njit(lambda x: 2 * x)
     assert third(2) == 4
-    assert said.getvalue().count("\n") == 1  # nobody listens any more
+    assert message.getvalue().count("\n") == 1  # nobody listens any more
 
 
-def test_nothing_is_said_where_nothing_is_compiled() -> None:
-    said = io.StringIO()
+def test_nothing_is_reported_where_nothing_is_compiled() -> None:
+    message = io.StringIO()
     known = numba.njit(lambda x: -x)
     known(1)
-    with compilation_announced(Console(file=said)):
+    with compilation_announced(Console(file=message)):
         known(2)
-    assert said.getvalue() == ""
+    assert message.getvalue() == ""

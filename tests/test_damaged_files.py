@@ -77,7 +77,7 @@ Damage = Callable[[np.random.Generator, bytes], bytes]
 
 
 @dataclass(frozen=True)
-class Subject:
+class Readable:
     """A file of a kind, and who reads it."""
 
     path: Path
@@ -87,27 +87,27 @@ class Subject:
 
 
 @pytest.fixture(scope="module")
-def subjects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Subject]:
+def readables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Readable]:
     """A whole file of every kind."""
     folder = tmp_path_factory.mktemp("whole")
     return {**_cases(folder), **_own(folder), **_sets(folder), **_foreign(folder), **_seen(folder)}
 
 
-def _cases(folder: Path) -> dict[str, Subject]:
+def _cases(folder: Path) -> dict[str, Readable]:
     root = Path(str(modeharvest.__file__)).parent
     harvest = folder / "experiment.toml"
     options = re.sub(r"^# (?=\w+ = (?!.*e\.g\.))", "", case_text("photographs"), flags=re.MULTILINE)
     harvest.write_text(options, "utf-8")
     return {
-        "case": Subject(root / "cases" / "paper-virtual.toml", Case.read),
-        "twin": Subject(root / "cases" / "paper-real-twin.toml", Case.read),
-        "lattice": Subject(root / "cases" / "square-lattice.toml", LatticeCase.read),
-        "study": Subject(root / "cases" / "studies" / "noise.toml", StudyCase.read),
-        "experiment": Subject(harvest, PhotographCase.read),
+        "case": Readable(root / "cases" / "paper-virtual.toml", Case.read),
+        "twin": Readable(root / "cases" / "paper-real-twin.toml", Case.read),
+        "lattice": Readable(root / "cases" / "square-lattice.toml", LatticeCase.read),
+        "study": Readable(root / "cases" / "studies" / "noise.toml", StudyCase.read),
+        "experiment": Readable(harvest, PhotographCase.read),
     }
 
 
-def _own(folder: Path) -> dict[str, Subject]:
+def _own(folder: Path) -> dict[str, Readable]:
     solution = made.solution(divisions=4)
     solution.write(folder / "solution.h5")
     write_modes(folder / "modes.h5", *sample())
@@ -120,11 +120,11 @@ def _own(folder: Path) -> dict[str, Subject]:
     )
     write_distortion(folder / "lens.json", PolynomialDistortion((40, 50), np.ones((2, 6))))
     return {
-        "solution": Subject(folder / "solution.h5", Solution.read),
-        "modes": Subject(folder / "modes.h5", read_modes),
-        "result": Subject(folder / "result.json", Result.read),
-        "family": Subject(folder / "family.json", lambda p: (read_family(p), read_spectrum(p))),
-        "lens": Subject(folder / "lens.json", read_distortion),
+        "solution": Readable(folder / "solution.h5", Solution.read),
+        "modes": Readable(folder / "modes.h5", read_modes),
+        "result": Readable(folder / "result.json", Result.read),
+        "family": Readable(folder / "family.json", lambda p: (read_family(p), read_spectrum(p))),
+        "lens": Readable(folder / "lens.json", read_distortion),
     }
 
 
@@ -133,7 +133,7 @@ def _whole_truth(path: Path) -> object:
     return [getattr(Truth.read(path), name) for name in names]
 
 
-def _sets(folder: Path) -> dict[str, Subject]:
+def _sets(folder: Path) -> dict[str, Readable]:
     _, truth = made.make(folder)
     star = make_star_set(
         StarSpec(Star(rows=41, cols=120), SpeckleSpec(blur_px=1.0)), folder / "star"
@@ -156,11 +156,13 @@ def _sets(folder: Path) -> dict[str, Subject]:
         return known.displacement(known.strains[0], [0.1], [0.1])
 
     return {
-        "images": Subject(truth / "images" / "images.json", images),
-        "truth": Subject(next((truth / "images").glob("truth_*.h5")), _whole_truth),
-        "benchmark": Subject(truth / "benchmark.json", benchmark),
-        "prepared": Subject(folder / "prepared.json", lambda p: PreparedPhotographs.read(p.parent)),
-        "star": Subject(star.folder / "star.json", lambda p: StarSet.read(p.parent)),
+        "images": Readable(truth / "images" / "images.json", images),
+        "truth": Readable(next((truth / "images").glob("truth_*.h5")), _whole_truth),
+        "benchmark": Readable(truth / "benchmark.json", benchmark),
+        "prepared": Readable(
+            folder / "prepared.json", lambda p: PreparedPhotographs.read(p.parent)
+        ),
+        "star": Readable(star.folder / "star.json", lambda p: StarSet.read(p.parent)),
     }
 
 
@@ -173,24 +175,24 @@ def _beside(path: Path, whole: Path) -> Path:
     return path.parent
 
 
-def _foreign(folder: Path) -> dict[str, Subject]:
+def _foreign(folder: Path) -> dict[str, Readable]:
     mesh = holed_cell(SQUARE, 2, (1, 1))
     points = np.column_stack([mesh.nodes, np.zeros(len(mesh.nodes))])
     u = {"u": 0.01 * points}
     x, y = (a.ravel().astype(float) for a in np.meshgrid(np.arange(6), np.arange(5)))
     columns = {"x": x, "y": y, "u": 0.1 * x, "v": 0.2 * y}
-    subjects = {}
+    readables = {}
     forms = {"msh": "gmsh", "inp": "abaqus"}
     for kind in ("vtu", "vtk", "msh", "inp", "xdmf", "med"):
         path, data = folder / f"mesh.{kind}", {} if kind == "inp" else u
         whole = meshio.Mesh(points, [("triangle6", mesh.cells)], point_data=data)
         whole.write(path, forms.get(kind, kind))
-        subjects[kind] = Subject(path, read_any_mesh if kind == "inp" else _solved, "mesh")
-    subjects["vtu field"] = Subject(folder / "mesh.vtu", _measured, "mesh")
+        readables[kind] = Readable(path, read_any_mesh if kind == "inp" else _solved, "mesh")
+    readables["vtu field"] = Readable(folder / "mesh.vtu", _measured, "mesh")
     savemat(folder / "field.mat", {"result": columns, "benchmark": "0123456789ab"})
     savemat(folder / "packed.mat", columns, do_compression=True)
     for name in ("field.mat", "packed.mat"):
-        subjects[name] = Subject(folder / name, _measured, "mat")
+        readables[name] = Readable(folder / name, _measured, "mat")
 
     table = np.column_stack(list(columns.values()))
     np.savetxt(folder / "field.csv", table, delimiter=",", header="x,y,u,v", comments="")
@@ -201,14 +203,14 @@ def _foreign(folder: Path) -> dict[str, Subject]:
             file.create_dataset(f"result/{name}", data=values, compression=4, chunks=(10,))
         file.attrs["benchmark"] = "0123456789ab"
     for name in ("field.csv", "field.npz", "packed.npz", "field.h5"):
-        subjects[name] = Subject(folder / name, _measured)
+        readables[name] = Readable(folder / name, _measured)
 
     (folder / "lens.yml").write_text(_YAML, "utf-8")
     (folder / "lens.xml").write_text(_XML, "utf-8")
     (folder / "dice.xml").write_text(_DICE, "utf-8")
     for name in ("lens.yml", "lens.xml", "dice.xml"):
-        subjects[name] = Subject(folder / name, read_distortion)
-    return subjects
+        readables[name] = Readable(folder / name, read_distortion)
+    return readables
 
 
 def _solved(path: Path) -> object:
@@ -219,7 +221,7 @@ def _measured(path: Path) -> object:
     return read_measured(path, GRID, "0123456789ab", Declared(units="px", y_axis="down"))
 
 
-def _seen(folder: Path) -> dict[str, Subject]:
+def _seen(folder: Path) -> dict[str, Readable]:
     levels = np.random.default_rng(0).integers(1, 250, (24, 30)).astype(np.uint8)
     colour = np.stack([levels, levels[::-1], levels], axis=-1)
     tifffile.imwrite(folder / "plain.tif", levels.astype(np.uint16))
@@ -234,7 +236,7 @@ def _seen(folder: Path) -> dict[str, Subject]:
         return lines
 
     names = ("plain.tif", "packed.tif", "grey.png", "grey.bmp", "grey.jpg", "colour.png")
-    return {name: Subject(folder / name, every) for name in names}
+    return {name: Readable(folder / name, every) for name in names}
 
 
 _YAML = """%YAML:1.0
@@ -381,24 +383,24 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_damaged_file_reads_or_is_refused_in_a_line(
-    subjects: dict[str, Subject], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    readables: dict[str, Readable], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    subject = subjects[name]
-    assert _outcome(subject.read, subject.path) == ""
-    damaged = variants(name, subject.path)
+    readable = readables[name]
+    assert _outcome(readable.read, readable.path) == ""
+    damaged = variants(name, readable.path)
     files: Iterable[Path]
-    if subject.child is None:
-        files = _one_after_the_other(tmp_path / subject.path.name, damaged)
+    if readable.child is None:
+        files = _one_after_the_other(tmp_path / readable.path.name, damaged)
     else:
-        files = [tmp_path / f"{k:03d}{subject.path.suffix}" for k in range(VARIANTS)]
+        files = [tmp_path / f"{k:03d}{readable.path.suffix}" for k in range(VARIANTS)]
         for path, content in zip(files, damaged, strict=True):
             path.write_bytes(content)
-        _read_at_once(monkeypatch, subject.child, files)
+        _read_at_once(monkeypatch, readable.child, files)
     refused, begin = 0, _peak_bytes(reset=True)
     for k, path in enumerate(files):
         if k % 50 == 0:  # a limit for so many together: setting one takes longer than many a read
             faulthandler.dump_traceback_later(LONGEST_S, exit=True)
-        refused += bool(_outcome(subject.read, path))
+        refused += bool(_outcome(readable.read, path))
     faulthandler.cancel_dump_traceback_later()
     assert refused > VARIANTS / 20
     assert _peak_bytes() - begin < LARGEST_BYTES
@@ -423,18 +425,18 @@ def _read_at_once(monkeypatch: pytest.MonkeyPatch, kind: str, files: list[Path])
         "    print(path, end='\\t', flush=True)\n"
         "    print(child.convert(kind, path, path + '.npz'), flush=True)\n"
     )
-    said: dict[str, str] = {}
-    while len(said) < len(files):
-        command = [sys.executable, "-c", script, kind, *map(str, files[len(said) :])]
+    message: dict[str, str] = {}
+    while len(message) < len(files):
+        command = [sys.executable, "-c", script, kind, *map(str, files[len(message) :])]
         done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S)
         lines = done.stdout.splitlines()
-        said |= {p: words for p, _, words in (line.partition("\t") for line in lines)}
+        message |= {p: words for p, _, words in (line.partition("\t") for line in lines)}
         assert lines
 
     def read(kind: str, path: Path, what: str, remedy: str) -> dict[str, Any]:
         with reading(path, what, remedy):
-            if said[str(path)] or not (found := Path(f"{path}.npz")).is_file():
-                raise ValueError(said[str(path)] or "a file that makes its parser crash")
+            if message[str(path)] or not (found := Path(f"{path}.npz")).is_file():
+                raise ValueError(message[str(path)] or "a file that makes its parser crash")
             with np.load(found) as file:
                 return {str(n): file[f"arr_{k}"] for k, n in enumerate(file["names"])}
 

@@ -189,9 +189,9 @@ def test_disturbed_runs_end_like_an_undisturbed_one(
     assert len(full) > 1
     assert lasting(full[-1]["files"]) == expected
     for failed in full[:-1]:
-        (line,) = [row for row in failed["said"].splitlines() if "error:" in row]
+        (line,) = [row for row in failed["message"].splitlines() if "error:" in row]
         assert "No space left on device" in line
-        assert "Traceback" not in failed["said"]
+        assert "Traceback" not in failed["message"]
         for path, digest in lasting(failed["files"]).items():
             if Path(path).name != "stages.json":  # every file is whole that is there at all
                 assert digest == expected[path], path

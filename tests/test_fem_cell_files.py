@@ -158,8 +158,8 @@ def test_the_live_model_is_taken_and_kept(live: None, capfd: pytest.CaptureFixtu
     square(1.0, 0.8, 0.2)  # a model of our own comes and goes
     assert gmsh.model.getCurrent() == "mine"
     assert gmsh.model.getEntities(2) == [(2, plate)]
-    said = capfd.readouterr()
-    assert (said.out, said.err) == ("", "")
+    printed = capfd.readouterr()
+    assert (printed.out, printed.err) == ("", "")
 
 
 def test_named_surfaces_are_the_material(live: None, tmp_path: Path) -> None:
@@ -257,8 +257,8 @@ def test_bad_geometries_are_refused_in_one_line_and_silently(
     with pytest.raises(InputError, match=message) as caught:
         read_cell(geometry(tmp_path / "bad.geo", text), size=0.3)
     assert "\n" not in str(caught.value)
-    said = capfd.readouterr()
-    assert (said.out, said.err) == ("", "")
+    printed = capfd.readouterr()
+    assert (printed.out, printed.err) == ("", "")
     assert not gmsh.isInitialized()
 
 

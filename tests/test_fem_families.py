@@ -180,7 +180,7 @@ def test_recipe_of_the_page(
     recipe = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     exec(compile(recipe, "docs/families.md", "exec", dont_inherit=True), {})
-    said = re.sub(r"[\d.]+", "#", capsys.readouterr().out).splitlines()
+    message = re.sub(r"[\d.]+", "#", capsys.readouterr().out).splitlines()
     shown = re.sub(r"[\d.]+", "#", page).splitlines()
-    assert [line.strip() for line in shown if line.strip() in said] == said
+    assert [line.strip() for line in shown if line.strip() in message] == message
     assert read_family("square.json").info["critical_strain"] == pytest.approx(0.03, rel=0.03)

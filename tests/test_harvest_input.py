@@ -39,7 +39,7 @@ v_degree = 1
 """
 
 
-def scene(seed: int = 2) -> Photographed:
+def photographed(seed: int = 2) -> Photographed:
     return Photographed(PixelGrid.centred(310, 250, PIXEL), DOMAIN, HOLES, 1.4, seed)
 
 
@@ -48,7 +48,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with nothing wrong in it."""
     folder = tmp_path_factory.mktemp("sound")
     states = {f"frame_{n}": of(ANSATZ, ANSATZ.initial_guess(0.02 * n, 0.0)) for n in (1, 2, 3)}
-    scene().save(folder, states)
+    photographed().save(folder, states)
     (folder / "experiment.toml").write_text(EXPERIMENT)
     return folder
 
@@ -113,7 +113,7 @@ CASES: dict[str, tuple[Spoil, str]] = {
     "no scale": (text(f"pixel_size = {PIXEL}", ""), "pixel_size"),
     "missing frame": (text('"frame_*.tif"', '"frame_1.tif", "no.tif"'), "no.tif"),
     "other specimen": (
-        and_a_file(nothing, "reference.tif", scene(seed=7).image()), "not the reference"),
+        and_a_file(nothing, "reference.tif", photographed(seed=7).image()), "not the reference"),
     "material of other size": (and_a_file(mask("material", "m.tif"), "m.tif", SMALL), "m.tif"),
     "cells of other size": (and_a_file(mask("cells", "m.tif"), "m.tif", SMALL), "m.tif"),
     "no such mask": (mask("material", "m.tif"), "m.tif"),
@@ -146,10 +146,10 @@ def test_it_is_one_line_and_nothing_is_lost(
     monkeypatch.setattr(sys, "argv", arguments)
     with pytest.raises(SystemExit) as end:
         main()
-    said = capsys.readouterr().err
+    printed = capsys.readouterr().err
     assert end.value.code == 2
-    assert "Traceback" not in said
-    (line,) = [row for row in said.splitlines() if row.startswith("error:")]
+    assert "Traceback" not in printed
+    (line,) = [row for row in printed.splitlines() if row.startswith("error:")]
     assert message in line
     assert all(path.read_bytes() == content for path, content in before.items())
     assert not (out / "summary.json").exists()
@@ -157,7 +157,7 @@ def test_it_is_one_line_and_nothing_is_lost(
 
 def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
     """A constant one, one of 16 bits, and one whose mask is of another size."""
-    shape = scene().grid.shape
+    shape = photographed().grid.shape
     tifffile.imwrite(folder / "frame_1a.tif", np.full(shape, 90, dtype=np.uint8))
     deep = tifffile.imread(folder / "frame_2.tif").astype(np.uint16) * 257
     tifffile.imwrite(folder / "frame_1b.tif", deep)
@@ -178,10 +178,10 @@ def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
 
 def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) -> None:
     """The files are counted by the photographs that were given, not by those that were left."""
-    tifffile.imwrite(folder / "frame_2.tif", np.full(scene().grid.shape, 90, dtype=np.uint8))
+    tifffile.imwrite(folder / "frame_2.tif", np.full(photographed().grid.shape, 90, dtype=np.uint8))
     grid = np.stack(np.meshgrid(np.arange(40, 210, 8), np.arange(40, 270, 8)), -1).reshape(-1, 2)
     for n in (1, 2, 3):
-        points = np.column_stack(scene().grid.to_mm(grid[:, 1], grid[:, 0]))
+        points = np.column_stack(photographed().grid.to_mm(grid[:, 1], grid[:, 0]))
         u = of(ANSATZ, ANSATZ.initial_guess(0.02 * n, 0.0))(points) / PIXEL
         rows = np.column_stack([grid, u[:, 0], -u[:, 1]])
         header = "x [px],y [px],u [px],v [px]"
@@ -198,7 +198,7 @@ def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) ->
 
 def test_repeats_between_which_something_moved_are_reported() -> None:
     """Half a pixel looks like noise, but not like that of a single photograph."""
-    shown = scene()
+    shown = photographed()
     still, moved = (
         measured_noise([shown.image(), shown.image(state, exposure=1)], shown.mask)
         for state in (None, lambda points: np.full_like(points, 0.5 * PIXEL))

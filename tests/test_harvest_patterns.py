@@ -42,9 +42,11 @@ def harvesting(folder: Path, specimen: str = "", correlation: str = "") -> Harve
     return HarvestRun(PhotographCase.read(folder / "experiment.toml"), folder / "out")
 
 
-def error_px(measured: MeasuredPhotograph, scene: Photographed, truth: Displacement) -> float:
+def error_px(
+    measured: MeasuredPhotograph, photographed: Photographed, truth: Displacement
+) -> float:
     """Rms per component over the material."""
-    off = (measured.result.displacement() - truth(scene.points))[scene.mask]
+    off = (measured.result.displacement() - truth(photographed.points))[photographed.mask]
     return float(np.sqrt(np.mean(off**2)) / PIXEL)
 
 
@@ -65,9 +67,9 @@ def test_three_waves_of_a_hexagonal_lattice_are_three_modes(tmp_path: Path) -> N
     for i, size in enumerate((3.0, -2.2, 2.6)):
         a[ansatz.v_slice(i)][0] = size
     holes = lattice_points(vectors, Box.centred(5 * PITCH + 0.1, 6.4 * vectors[1, 1]), (0.0, 0.0))
-    scene = Photographed(PixelGrid.centred(358, 358, PIXEL), domain, holes, 1.4)
-    scene.save(tmp_path, {"frame": of(ansatz, a)})
-    run = harvesting(tmp_path, f"polygon = {corners(cellular, scene.grid)}")
+    photographed = Photographed(PixelGrid.centred(358, 358, PIXEL), domain, holes, 1.4)
+    photographed.save(tmp_path, {"frame": of(ansatz, a)})
+    run = harvesting(tmp_path, f"polygon = {corners(cellular, photographed.grid)}")
     measured = run.results()["frame"]
     assert run.geometry.lattice is not None
     assert run.geometry.lattice.kind == "hexagonal"
@@ -81,7 +83,7 @@ def test_three_waves_of_a_hexagonal_lattice_are_three_modes(tmp_path: Path) -> N
         near = min(min(np.linalg.norm(f - xi), np.linalg.norm(f + xi)) for f in found)
         assert near < 0.01 * np.linalg.norm(xi)
     # The truth is in the ansatz: what is left is noise, of 1 % of the contrast and 70 unknowns.
-    assert error_px(measured, scene, of(ansatz, a)) < 0.03
+    assert error_px(measured, photographed, of(ansatz, a)) < 0.03
 
 
 def two_patterns() -> tuple[Photographed, Displacement, tuple[Box, Box]]:
@@ -99,15 +101,15 @@ def two_patterns() -> tuple[Photographed, Displacement, tuple[Box, Box]]:
     for i, size in enumerate((3.0, 2.5)):
         a[ansatz.v_slice(i)][0] = size
     holes = lattice_points(PITCH * np.eye(2), cellular, (PITCH / 2, PITCH / 2))
-    scene = Photographed(PixelGrid.centred(450, 358, PIXEL), domain, holes, 1.4)
-    return scene, of(ansatz, a), (above, below)
+    photographed = Photographed(PixelGrid.centred(450, 358, PIXEL), domain, holes, 1.4)
+    return photographed, of(ansatz, a), (above, below)
 
 
 def test_regions_have_spectra_and_modes_of_their_own(tmp_path: Path) -> None:
-    scene, truth, boxes = two_patterns()
-    scene.save(tmp_path, {"frame": truth})
+    photographed, truth, boxes = two_patterns()
+    photographed.save(tmp_path, {"frame": truth})
     tables = [
-        f'[[specimen.regions]]\nname = "{name}"\npolygon = {corners(box, scene.grid)}\n'
+        f'[[specimen.regions]]\nname = "{name}"\npolygon = {corners(box, photographed.grid)}\n'
         for name, box in zip(("above", "below"), boxes, strict=True)
     ]
     run = harvesting(tmp_path, "".join(tables))
@@ -118,10 +120,10 @@ def test_regions_have_spectra_and_modes_of_their_own(tmp_path: Path) -> None:
     for mode, box in zip(modes, boxes, strict=True):
         own = mode.taper.cellular
         assert (own.y_min, own.y_max) == pytest.approx((box.y_min, box.y_max), abs=1e-9)
-    said = " ".join(measured.text)
-    assert "Region 'above', v1 phi1:" in said
-    assert "Region 'below', v2 phi2:" in said
-    assert error_px(measured, scene, truth) < 0.03
+    message = " ".join(measured.text)
+    assert "Region 'above', v1 phi1:" in message
+    assert "Region 'below', v2 phi2:" in message
+    assert error_px(measured, photographed, truth) < 0.03
     (frame,) = run.harvest().frames
     assert [part.name for part in frame.parts] == ["above", "below"]
     waves = [[wave.xi for wave in part.pattern.waves] for part in frame.parts]
@@ -134,7 +136,7 @@ def test_regions_have_spectra_and_modes_of_their_own(tmp_path: Path) -> None:
 
 def test_a_pattern_that_becomes_another_one_is_not_followed_as_the_old_one(tmp_path: Path) -> None:
     """First square, then alternately sheared rows, then these again."""
-    scene, *_ = two_patterns()
+    photographed, *_ = two_patterns()
     cellular = Box.centred(6 * PITCH, 8 * PITCH)
     domain = Box.centred(6 * PITCH + 1.6, 17.0)
     states = {}
@@ -146,7 +148,7 @@ def test_a_pattern_that_becomes_another_one_is_not_followed_as_the_old_one(tmp_p
         mode = FourierMode.scaled(family, PITCH, Taper(cellular, PITCH / 2))
         ansatz = Ansatz(domain, (mode,), v0_degree=3, v_degree=0)
         states[name] = of(ansatz, ansatz.initial_guess(0.04, size))
-    scene.save(tmp_path, states)
+    photographed.save(tmp_path, states)
     results = harvesting(tmp_path).results()
     assert [m.result.ansatz.modes[0].family.name for m in results.values()] == [
         "square", "1 wave, free", "1 wave, free"]  # fmt: skip
@@ -154,7 +156,7 @@ def test_a_pattern_that_becomes_another_one_is_not_followed_as_the_old_one(tmp_p
     assert goes_on == [False, False, True]
     for name, measured in results.items():
         # The cellular part is found here to some hundredths of a pixel, not given.
-        assert error_px(measured, scene, states[name]) < 0.05
+        assert error_px(measured, photographed, states[name]) < 0.05
 
 
 @pytest.mark.parametrize(
@@ -167,8 +169,8 @@ def test_a_pattern_that_becomes_another_one_is_not_followed_as_the_old_one(tmp_p
 def test_parts_that_can_not_be_are_refused(
     tmp_path: Path, polygons: tuple[list[int], list[int]], message: str
 ) -> None:
-    scene, *_ = two_patterns()
-    scene.save(tmp_path, {"frame": None})
+    photographed, *_ = two_patterns()
+    photographed.save(tmp_path, {"frame": None})
     tables = [
         f'[[specimen.regions]]\nname = "{name}"\n'
         f"polygon = [[{a},{b}],[{c},{b}],[{c},{d}],[{a},{d}]]\n"
@@ -191,12 +193,12 @@ def test_a_column_that_leaves_the_image_does_not_move_the_lattice_by_a_cell(
     holes = lattice_points(PITCH * np.eye(2), Box(-5.0, 12.0, -12.0, 12.0), (0.0, 0.0))
     if not edge:
         holes = lattice_points(PITCH * np.eye(2), Box.centred(30.0, 24.0), (0.0, 0.0))
-    scene = Photographed(PixelGrid.centred(275, 333, PIXEL), boundary, holes, 1.4)
+    photographed = Photographed(PixelGrid.centred(275, 333, PIXEL), boundary, holes, 1.4)
 
     def truth(points: FloatArray) -> FloatArray:
         return 0.8 * PITCH * np.array([1.0, 0.0]) - 0.01 * points
 
-    scene.save(tmp_path, {"frame": truth})
+    photographed.save(tmp_path, {"frame": truth})
     measured = harvesting(tmp_path).results()["frame"]
     assert "decided by the speckle" in measured.text[0]
-    assert error_px(measured, scene, truth) < 0.1
+    assert error_px(measured, photographed, truth) < 0.1

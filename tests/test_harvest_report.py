@@ -120,14 +120,14 @@ def test_ids_are_unique_and_links_lead_somewhere(text: str) -> None:
     assert set(re.findall(r"url\(#([^)]+)\)", text)) <= set(page.ids)
 
 
-def test_words_of_users_are_escaped_and_said(text: str) -> None:
+def test_words_of_users_are_escaped_and_reported(text: str) -> None:
     assert "Made up &lt;for tests&gt;" in text
     assert "expected an image &lt;of 290 x 250 px&gt;, got a damaged file" in text
     assert "<for tests>" not in text
-    for said in ("The material was found by its speckle.", "v0 starts from the local DIC.",
+    for message in ("The material was found by its speckle.", "v0 starts from the local DIC.",
                  "S is a polynomial of degree 3", "measured from 3 exposures",
                  "modeharvest harvest EXPERIMENT.toml"):  # fmt: skip
-        assert said in text
+        assert message in text
     assert text.count("✗ missed") == text.count("✓ met") == 1
 
 
@@ -190,10 +190,10 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
 
 def test_photographs_alike_are_distinguished_by_their_names(summary: dict[str, Any]) -> None:
     first, second = summary["frames"]
-    said = photograph_labels([first, second, second | {"name": "again"}])
+    message = photograph_labels([first, second, second | {"name": "again"}])
     at = "After buckling · 7\N{NO-BREAK SPACE}%"
-    assert list(said.values())[1:] == [f"{at} · IMG_2", f"{at} · again"]
-    assert "IMG_1" not in said["IMG_1"]
+    assert list(message.values())[1:] == [f"{at} · IMG_2", f"{at} · again"]
+    assert "IMG_1" not in message["IMG_1"]
 
 
 def test_advice_that_was_taken_is_not_given_again(harvest: Harvest) -> None:
@@ -310,12 +310,12 @@ def test_an_affine_part_of_a_distortion_is_not_an_error() -> None:
 def test_warnings_outcomes_and_the_noise_are_reported(summary: dict[str, Any]) -> None:
     change = {"outcome": "stagnated", "outcome_why": "No step.", "warnings": ["beware of this"]}
     frame = summary["frames"][1] | change
-    said = notes(summary | {"frames": [frame]})
+    message = notes(summary | {"frames": [frame]})
     at = "IMG_2, 7\N{NO-BREAK SPACE}%: "
-    assert f"{at}the correlation ended as “stagnated”: No step." in said
+    assert f"{at}the correlation ended as “stagnated”: No step." in message
     report = photographs_report(summary | {"frames": [frame]})
     assert "IMG_2: beware of this." in report.warnings
-    assert any("25 grey levels, 0.61 % of full scale, measured" in note for note in said)
+    assert any("25 grey levels, 0.61 % of full scale, measured" in note for note in message)
 
 
 @pytest.mark.parametrize(

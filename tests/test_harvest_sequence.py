@@ -26,7 +26,7 @@ DOMAIN = Box.centred(4 * PITCH + 1.6, 5 * PITCH + 1.6)
 HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, 0.0))
 
 
-def scene(seed: int = 2) -> Photographed:
+def photographed(seed: int = 2) -> Photographed:
     return Photographed(PixelGrid.centred(360, 300, PIXEL), DOMAIN, HOLES, 1.4, seed)
 
 
@@ -40,8 +40,8 @@ def truth(strain: float) -> Displacement:
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five states, and a photograph of another specimen between the third and the fourth."""
     folder = tmp_path_factory.mktemp("photographs")
-    scene().save(folder, {f"frame_{1e4 * e:03.0f}": truth(e) for e in STRAINS})
-    tifffile.imwrite(folder / f"{FOREIGN}x.tif", scene(seed=9).image(truth(0.052)))
+    photographed().save(folder, {f"frame_{1e4 * e:03.0f}": truth(e) for e in STRAINS})
+    tifffile.imwrite(folder / f"{FOREIGN}x.tif", photographed(seed=9).image(truth(0.052)))
     return folder
 
 
@@ -73,7 +73,7 @@ def test_buckling_is_bracketed_and_estimated(harvesting: HarvestRun) -> None:
 
 
 def test_every_frame_is_measured(harvesting: HarvestRun) -> None:
-    results, shown = harvesting.results(), scene()
+    results, shown = harvesting.results(), photographed()
     assert [name for name, _ in harvesting.failures()] == [f"{FOREIGN}x"]
     for strain, measured in zip(STRAINS, results.values(), strict=True):
         assert measured.result.outcome is Outcome.CONVERGED

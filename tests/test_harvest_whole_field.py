@@ -39,7 +39,7 @@ W_PX = 0.8
 CELLULAR, DOMAIN = Box.centred(4 * PITCH, 4 * PITCH), Box.centred(4 * PITCH + 1.6, 4 * PITCH + 1.6)
 HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, PITCH / 2))
 ANSATZ = Ansatz.on(DOMAIN, [(square_family("junction"), CELLULAR)], PITCH)
-SCENE = Photographed(PixelGrid.centred(310, 310, PIXEL), DOMAIN, HOLES, 1.4)
+PHOTOGRAPHED = Photographed(PixelGrid.centred(310, 310, PIXEL), DOMAIN, HOLES, 1.4)
 STATES = {"frame_1": 0.03, "frame_2": 0.05}
 FloatArray = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def truth(strain: float) -> Displacement:
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photographs")
-    SCENE.save(folder, {name: truth(strain) for name, strain in STATES.items()})
+    PHOTOGRAPHED.save(folder, {name: truth(strain) for name, strain in STATES.items()})
     return folder
 
 
@@ -99,11 +99,11 @@ def test_what_the_ansatz_cannot_describe_is_measured(
         assert [name for name, found in run.results().items() if found.whole] == list(STATES)
     for name, strain in STATES.items():
         measured = read_result(folder / "whole_field" / f"{name}.h5")
-        error = measured.displacement_on() - truth(strain)(SCENE.points)
-        there = SCENE.mask & np.isfinite(error[..., 0])
-        assert there.sum() > 0.999 * SCENE.mask.sum()
+        error = measured.displacement_on() - truth(strain)(PHOTOGRAPHED.points)
+        there = PHOTOGRAPHED.mask & np.isfinite(error[..., 0])
+        assert there.sum() > 0.999 * PHOTOGRAPHED.mask.sum()
         correlated = Result.read(folder / "results" / f"{name}.json")
-        by_idic = correlated.displacement() - truth(strain)(SCENE.points)
+        by_idic = correlated.displacement() - truth(strain)(PHOTOGRAPHED.points)
         # Noise of 1 % and masks found to a pixel leave 0.1 px; the ansatz leaves w.
         assert rms_px(error, there) < 0.12
         assert rms_px(error, there) < 0.4 * rms_px(by_idic, there)
@@ -114,7 +114,7 @@ def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) 
     found = summary(harvested)
     assert not undocumented(found, "harvest.md")
     last = found["frames"][-1]["whole_field"]
-    expected = rms_px(w(SCENE.points), SCENE.mask)
+    expected = rms_px(w(PHOTOGRAPHED.points), PHOTOGRAPHED.mask)
     assert last["w_rms_px"] == pytest.approx(expected, rel=0.1)
     assert last["w_rms_px"] < last["w_max_px"]
     assert last["coverage"] > 0.999
@@ -131,13 +131,15 @@ def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) 
     assert [p["deviation"] for p in mode["parameters"]] == pytest.approx(
         list(refit.standard_errors()[refit.ansatz.phi_slice(0)])
     )
-    true = truth(STATES["frame_2"])(SCENE.points)
-    best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
-    apart = rms_px(refit.displacement() - best.displacement(), SCENE.mask)
+    true = truth(STATES["frame_2"])(PHOTOGRAPHED.points)
+    best = fit_displacement(
+        true, PHOTOGRAPHED.grid, refit.ansatz, refit.unknowns, PHOTOGRAPHED.mask
+    )
+    apart = rms_px(refit.displacement() - best.displacement(), PHOTOGRAPHED.mask)
     # What noise of 1 % and masks found to a pixel leave; w pulls IDIC away from it.
     assert apart < 0.02
     correlated = Result.read(harvested / "results" / "frame_2.json")
-    assert apart < 0.3 * rms_px(correlated.displacement() - best.displacement(), SCENE.mask)
+    assert apart < 0.3 * rms_px(correlated.displacement() - best.displacement(), PHOTOGRAPHED.mask)
     page = (harvested / "report.html").read_text("utf-8")
     for words in (
         "Microfluctuation field, measured", "Principal strain", "Modes by both ways",
@@ -149,15 +151,21 @@ def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) 
 def test_against_the_truth(harvested: Path) -> None:
     measured = read_result(harvested / "whole_field" / "frame_2.h5")
     refit = Result.read(harvested / "whole_field" / "frame_2_refit.json")
-    true = np.where(SCENE.mask[..., None], truth(STATES["frame_2"])(SCENE.points), np.nan)
-    best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
+    true = np.where(
+        PHOTOGRAPHED.mask[..., None], truth(STATES["frame_2"])(PHOTOGRAPHED.points), np.nan
+    )
+    best = fit_displacement(
+        true, PHOTOGRAPHED.grid, refit.ansatz, refit.unknowns, PHOTOGRAPHED.mask
+    )
     specimen = Specimen(holes_x=4, holes_y=4, diameter=1.4, pitch=PITCH)
-    errors = compare_whole(WholeField(measured, refit, 1.0), true, best, SCENE.mask, specimen)
+    errors = compare_whole(
+        WholeField(measured, refit, 1.0), true, best, PHOTOGRAPHED.mask, specimen
+    )
     error = true - measured.displacement_on()
     assert errors.rms_px == pytest.approx(rms_px(error, np.isfinite(error[..., 0])))
     assert errors.rms_edges_px is not None
     assert errors.rms_px < errors.rms_edges_px < errors.max_px
-    rows = whole_checks("frame_2", refit, best, errors, SCENE.mask)
+    rows = whole_checks("frame_2", refit, best, errors, PHOTOGRAPHED.mask)
     found = [row.obtained for row in rows]
     assert found == [errors.rms_px, errors.rms_edges_px, v_percent(refit, best),
                      waves_percent(refit, best)]  # fmt: skip
@@ -167,7 +175,11 @@ def test_against_the_truth(harvested: Path) -> None:
 def test_deviations_of_a_mode_from_the_best_fit() -> None:
     a = ANSATZ.initial_guess(0.05, 3.0)
     best = fit_displacement(
-        ANSATZ.displacement(a, SCENE.grid.x, SCENE.grid.y), SCENE.grid, ANSATZ, a, SCENE.mask
+        ANSATZ.displacement(a, PHOTOGRAPHED.grid.x, PHOTOGRAPHED.grid.y),
+        PHOTOGRAPHED.grid,
+        ANSATZ,
+        a,
+        PHOTOGRAPHED.mask,
     )
     larger, turned = best.unknowns.copy(), best.unknowns.copy()
     larger[ANSATZ.v_slice(0)] *= 1.01
@@ -190,21 +202,21 @@ def test_a_correlation_that_went_astray_is_done_again(photographs: Path, harvest
     """From the whole displacement, which then starts from the images alone."""
     case = PhotographCase.read(experiment(photographs, "[whole_field]\nmeasure = true\n"))
     run = HarvestRun(case, harvested)
-    first, true = run.results()["frame_2"], truth(STATES["frame_2"])(SCENE.points)
+    first, true = run.results()["frame_2"], truth(STATES["frame_2"])(PHOTOGRAPHED.points)
     right, on_mesh = first.result, FiniteElementOptions(edge_px=2)
     lost = replace(right, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.0 * right.unknowns)
     still = replace(first.local, u=0.0 * first.local.u)
     found = measure_whole(
         run.prepared.pair("frame_2"), run.geometry, PITCH, case.correlation,
         replace(first, result=lost, local=still),
-        on_mesh.body(run.geometry.mask, SCENE.grid), on_mesh, run.prepared.noise,
+        on_mesh.body(run.geometry.mask, PHOTOGRAPHED.grid), on_mesh, run.prepared.noise,
     )  # fmt: skip
     assert found.whole is not None
     assert found.whole.start == "blocks of the speckle"
     error = found.whole.measured.displacement_on() - true
-    assert rms_px(error, SCENE.mask & np.isfinite(error[..., 0])) < 0.12
+    assert rms_px(error, PHOTOGRAPHED.mask & np.isfinite(error[..., 0])) < 0.12
     assert found.result.outcome is Outcome.CONVERGED
-    assert rms_px(found.result.displacement() - right.displacement(), SCENE.mask) < 0.01
+    assert rms_px(found.result.displacement() - right.displacement(), PHOTOGRAPHED.mask) < 0.01
     assert "started from the ansatz fitted to the whole displacement" in found.text[-2]
 
 
@@ -220,16 +232,18 @@ def test_a_family_with_fewer_parameters_takes_the_place_of_free_waves(
     ansatz = replace(square.ansatz, modes=(replace(mode, family=waves),))
     guess = ansatz.initial_guess()
     guess[: ansatz.phi_offset(0)] = square.unknowns[: ansatz.phi_offset(0)]
-    free = fit_displacement(square.displacement(), SCENE.grid, ansatz, guess, SCENE.mask)
+    free = fit_displacement(
+        square.displacement(), PHOTOGRAPHED.grid, ansatz, guess, PHOTOGRAPHED.mask
+    )
     assert free.outcome is Outcome.CONVERGED
     found = measure_whole(
         run.prepared.pair("frame_2"), run.geometry, PITCH, case.correlation,
         replace(first, result=free),
-        on_mesh.body(run.geometry.mask, SCENE.grid), on_mesh, run.prepared.noise,
+        on_mesh.body(run.geometry.mask, PHOTOGRAPHED.grid), on_mesh, run.prepared.noise,
     )  # fmt: skip
     assert [mode.family.size for mode in found.result.ansatz.modes] == [7]
     assert found.result.outcome is Outcome.CONVERGED
-    assert rms_px(found.result.displacement() - square.displacement(), SCENE.mask) < 0.01
+    assert rms_px(found.result.displacement() - square.displacement(), PHOTOGRAPHED.mask) < 0.01
 
 
 @pytest.mark.usefixtures("unrendered_pictures")
@@ -252,11 +266,13 @@ def test_where_every_correlation_is_in_a_local_minimum_the_refitted_ansatz_is_th
         assert frame["errors_px"]["noise"]["displacement"] < 0.02
         result = Result.read(tmp_path / "results" / f"{name}.json")
         refit = Result.read(tmp_path / "whole_field" / f"{name}_refit.json")
-        assert rms_px(result.displacement() - refit.displacement(), SCENE.mask) < 1e-6
-        true = truth(STATES[name])(SCENE.points)
-        best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
+        assert rms_px(result.displacement() - refit.displacement(), PHOTOGRAPHED.mask) < 1e-6
+        true = truth(STATES[name])(PHOTOGRAPHED.points)
+        best = fit_displacement(
+            true, PHOTOGRAPHED.grid, refit.ansatz, refit.unknowns, PHOTOGRAPHED.mask
+        )
         # As after a correlation that ends in no local minimum.
-        assert rms_px(result.displacement() - best.displacement(), SCENE.mask) < 0.02
+        assert rms_px(result.displacement() - best.displacement(), PHOTOGRAPHED.mask) < 0.02
         # w makes the residual what it is: 0.8 px beside speckles of 12 px.
         assert 0.5 < frame["model_error_px"] / (STATES[name] / 0.05 * W_PX / np.sqrt(2.0)) < 1.5
 

@@ -210,7 +210,7 @@ def test_a_specimen_that_overlaps_gives_a_warning(made: ImageSet, tmp_path: Path
     slid = np.repeat([[0.2, 0.0], [0.0, 0.0]], 4, axis=0)  # the left half by 4 px to the right
     moved = Solution(apart, (Snapshot(0.1, slid),), {})
     overlapping = make_images(moved, SPEC, tmp_path / "overlap", (0.1,))
-    # Strictly inside both: 3 columns; of 21 rows, 2 lie on the outline.
+    # Strictly inside both: 3 columns; of 21 rows, 2 lie on the boundary.
     assert overlapping.info["snapshots"][0]["doubly_covered_px"] == 3 * 19
     assert overlapping.info["reference"]["doubly_covered_px"] == 0
     (warning,) = overlapping.info["warnings"]

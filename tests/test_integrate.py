@@ -38,7 +38,7 @@ APERTURES = [
 ]
 
 
-def scene(displacement: FloatArray | None = None, background: float = 0.1) -> ImagedState:
+def imaged(displacement: FloatArray | None = None, background: float = 0.1) -> ImagedState:
     return ImagedState(PLATE, displacement, GRID, SPECKLE, background)
 
 
@@ -159,14 +159,14 @@ def test_scattered_points_see_a_straight_edge_to_half_a_percent(aperture: Apertu
 @pytest.mark.parametrize("aperture", APERTURES)
 def test_reference_and_undeformed_image_agree(aperture: Aperture) -> None:
     """Fourier multiplication on one side, the Gauss rule in every pixel on the other."""
-    mask = material(scene())
-    spectral, exactly = integrate(scene(), aperture, mask)
-    ruled, quadrature = integrate(scene(np.zeros((4, 2))), aperture, mask)
+    mask = material(imaged())
+    spectral, exactly = integrate(imaged(), aperture, mask)
+    ruled, quadrature = integrate(imaged(np.zeros((4, 2))), aperture, mask)
     assert (exactly.points, quadrature.points > 1) == (0, True)
     inside = mask & ~near_edges(mask, aperture.reach_px)
     assert inside.sum() > 800
     error = (ruled - spectral)[inside]
-    pattern = scene().speckle.spline.bound
+    pattern = imaged().speckle.spline.bound
     assert np.sqrt((error**2).mean()) <= quadrature.rms_bound + pattern
     np.testing.assert_array_equal(ruled[~inside], spectral[~inside])
 
@@ -175,7 +175,7 @@ def test_reference_and_undeformed_image_agree(aperture: Aperture) -> None:
 def test_deformed_pixels_show_the_weighted_integral(aperture: Aperture) -> None:
     """Against a fine rule over h itself, in closed form, at some pixels of an affine motion."""
     F, shift = np.array([[0.9, 0.08], [-0.05, 1.07]]), np.array([0.21, -0.13])
-    state = scene(PLATE.nodes @ (F - np.eye(2)).T + shift)
+    state = imaged(PLATE.nodes @ (F - np.eye(2)).T + shift)
     mask = material(state)
     image, _ = integrate(state, aperture, mask)
     rows, cols = np.nonzero(mask & ~near_edges(mask, aperture.reach_px))
@@ -232,13 +232,13 @@ def test_background_and_material_far_from_edges_are_distinguished() -> None:
 
 def test_compression_is_the_largest_among_elements() -> None:
     F = np.array([[0.8, 0.1], [0.0, 1.2]])
-    state = scene(PLATE.nodes @ (F - np.eye(2)).T)
+    state = imaged(PLATE.nodes @ (F - np.eye(2)).T)
     assert state.compression == pytest.approx(1 / np.linalg.svd(F, compute_uv=False).min())
-    assert scene().compression == 1.0
+    assert imaged().compression == 1.0
 
 
 def test_threads_do_not_change_a_bit() -> None:
-    state = scene(0.02 * PLATE.nodes[:, ::-1])
+    state = imaged(0.02 * PLATE.nodes[:, ::-1])
     mask, aperture = material(state), Aperture(1.0, 0.4)
     before = numba.get_num_threads()
     many, _ = integrate(state, aperture, mask)

@@ -62,8 +62,8 @@ def test_deformed_images_show_the_analytic_pattern(intensity: ModuleType, unit: 
 def test_averages_over_pixels_within_an_element_keep_their_promise(intensity: ModuleType) -> None:
     """And pixels that a kink of the deformation cuts are off by what a kink costs."""
     mesh = quads()
-    scene = ImagedState(mesh, bent(mesh), GRID, Speckle(SpeckleSpec(seed=4), GRID.shape), 0.0)
-    points, errors = intensity.aperture_errors(scene, Aperture(1.0), 7, 987)
+    imaged = ImagedState(mesh, bent(mesh), GRID, Speckle(SpeckleSpec(seed=4), GRID.shape), 0.0)
+    points, errors = intensity.aperture_errors(imaged, Aperture(1.0), 7, 987)
     assert points == 9
     within, cut, hole = (
         errors[k] for k in ("within one element", "cut by an element's edge", "at a hole's edge")

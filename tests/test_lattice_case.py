@@ -111,7 +111,7 @@ def test_the_tour_suits_the_lattice_and_its_load() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ('[lattice]\nkind = "sqare"', "lattice kind among"),
         ("[lattice]\ndiametre = 1.0", "did you mean 'diameter'?"),
@@ -143,11 +143,11 @@ def test_the_tour_suits_the_lattice_and_its_load() -> None:
         ('[lattice]\nkind = "hexagonal"\n[study]', "expected a square lattice"),
     ],
 )
-def test_a_wrong_case_is_reported_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_case_is_reported_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     with pytest.raises(InputError) as caught:
         LatticeCase.read(written(tmp_path, text))
     message = str(caught.value)
-    assert said in message
+    assert expected in message
     assert "\n" not in message
     assert "mine.toml" in message
 

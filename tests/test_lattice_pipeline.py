@@ -303,7 +303,7 @@ def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[lattice]\npitch = 1.0\ndiameter = 1.0", "holes must not touch"),
         ('[lattice]\nkind = "file"\npitch = 1.0\npath = "nowhere.msh"', "nowhere.msh"),
@@ -316,13 +316,13 @@ def test_bad_input_is_reported_in_one_line(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     text: str,
-    said: str,
+    message: str,
 ) -> None:
     path = tmp_path / "bad.toml"
     text = text.replace("[lattice]\n[", "[lattice]\nmesh_size = 0.4\n[search]\nlargest = 0.01\n[")
     path.write_text(text, "utf-8")
     assert command(monkeypatch, "modes", path, "--out", tmp_path / "out") == 2
-    assert said in error_line(capsys)
+    assert message in error_line(capsys)
     reported = (tmp_path / "out" / "summary.json").exists()
     assert reported == ("[modes]" in text)  # all but the modes can be had
 

@@ -180,8 +180,8 @@ def test_waves_are_written_in_units_of_pi(wave: tuple[float, float], written: st
 
 
 def test_a_study_says_where_the_pattern_stops_coming_first() -> None:
-    said = " ".join(study_text(made_up.study()))
-    assert "from d/l = 0.69 on; at 0.67 it is long waves" in said
-    assert "between 0.930 (d/l = 0.3" in said
+    message = " ".join(study_text(made_up.study()))
+    assert "from d/l = 0.69 on; at 0.67 it is long waves" in message
+    assert "between 0.930 (d/l = 0.3" in message
     every = replace(made_up.study(), ratios=(made_up.row(0.7), made_up.row(0.9)), limits=())
     assert "first for every d/l looked at, from 0.7 to 0.9" in " ".join(study_text(every))

@@ -104,15 +104,15 @@ def test_holes_that_a_window_hardly_fits_into_are_found() -> None:
     assert (found != truth).mean() < 0.004  # one px along all edges would be 0.03
 
 
-def test_without_a_background_all_is_material_and_that_is_said() -> None:
+def test_without_a_background_all_is_material_and_that_is_reported() -> None:
     material = find_material(image(0.0, 0.01, np.ones(SHAPE, dtype=bool)))
     assert material.mask.all()
     assert "whole image" in material.text[0]
 
 
 def test_background_like_the_speckle_is_reported() -> None:
-    said = find_material(image(0.5, 0.03, specimen())).text
-    assert any("grey levels of the background" in message for message in said)
+    warnings = find_material(image(0.5, 0.03, specimen())).text
+    assert any("grey levels of the background" in message for message in warnings)
 
 
 def test_bad_images_are_refused() -> None:

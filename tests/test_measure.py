@@ -182,7 +182,7 @@ def test_material_is_found_and_lengths_are_pixels(plate: Plate, tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
-def test_what_of_a_mask_is_not_measured_is_said(plate: Plate, tmp_path: Path) -> None:
+def test_what_of_a_mask_is_not_measured_is_reported(plate: Plate, tmp_path: Path) -> None:
     mask = plate.mask.copy()
     assert not mask[:16].any()
     mask[4:12, 50:150] = True  # background
@@ -221,7 +221,7 @@ def test_elements_beside_the_mask_are_left_out(plate: Plate, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
-def test_what_does_not_match_is_said(plate: Plate, tmp_path: Path) -> None:
+def test_what_does_not_match_is_reported(plate: Plate, tmp_path: Path) -> None:
     image, other = (tifffile.imread(path) for path in (plate.files[0], plate.folder / "ref.tif"))
     image[120:150, 180:220] = other[60:90, 180:220]
     write_image(tmp_path / "patched.tif", image)

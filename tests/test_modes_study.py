@@ -114,7 +114,7 @@ def test_the_lattice_s_mode_lies_on_the_specimen_s_holes() -> None:
 
 
 @pytest.fixture(scope="module")
-def subject() -> ImagePairSpec:
+def spec() -> ImagePairSpec:
     """The paper's specimen on images of 0.05 mm/px, which take a tenth of a second."""
     case = StudyCase()
     assert PAPER is not None
@@ -138,14 +138,14 @@ def stable(specimen: Specimen) -> Solution:
 
 
 @pytest.fixture(scope="module")
-def measured(subject: ImagePairSpec, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ...]:
+def measured(spec: ImagePairSpec, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ...]:
     """A study of the base, of it twice as large, and of one that stays stable, without dolfinx."""
     folder = tmp_path_factory.mktemp("modes")
 
     def simulated(experiment: Experiment, wanted: float, largest: float) -> Solution:
         if experiment.specimen.pitch == 3.8:
             assert wanted == pytest.approx(2 * 0.287, abs=0.003)  # facts of the paper's specimen
-            return scaled(subject.solution, 2.0)
+            return scaled(spec.solution, 2.0)
         return stable(experiment.specimen)
 
     study = MeasuredModesStudy(
@@ -158,7 +158,7 @@ def measured(subject: ImagePairSpec, tmp_path_factory: pytest.TempPathFactory) -
             "lattice_mode",
             lambda specimen, material, divisions: mode_of(specimen.pitch),
         )
-        cases = study.prepare(subject, folder)
+        cases = study.prepare(spec, folder)
         rows = [{**case, "error": "", **one_specimen(case, folder)}
                 for case in cases]  # fmt: skip
     return study, pd.DataFrame(rows), folder
@@ -224,12 +224,12 @@ def test_other_ends_are_reported_and_left_out(measured: tuple[Any, ...]) -> None
     odd.loc[1, ["first", "simulation"]] = ["other", "the branch could be followed to 0.1 l only"]
     odd.loc[1, "pattern_share"] = 0.2
     odd.loc[2, "outcome"] = "local_minimum"
-    said = " ".join(report_modes(study.analyse(odd, folder), "seed 0").text)
-    assert "On 1 specimen with d/l" in said
-    assert "base: measured in a state that is not stable" in said
-    assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in said
-    assert "the branch could be followed to 0.1 l only" in said
-    assert "l 3.8 mm: the correlation ended local_minimum" in said
+    message = " ".join(report_modes(study.analyse(odd, folder), "seed 0").text)
+    assert "On 1 specimen with d/l" in message
+    assert "base: measured in a state that is not stable" in message
+    assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in message
+    assert "the branch could be followed to 0.1 l only" in message
+    assert "l 3.8 mm: the correlation ended local_minimum" in message
 
 
 def test_a_description_comes_back_as_it_was(measured: tuple[Any, ...]) -> None:
@@ -272,7 +272,7 @@ def test_the_shipped_study_spells_out_the_defaults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"ratios": (0.7, 1.0)}, "ratios d/l between 0 and 1"),
         ({"ratios": (0.7, 0.7)}, "ratios that differ"),
@@ -282,20 +282,20 @@ def test_the_shipped_study_spells_out_the_defaults() -> None:
         ({"largest": 0.7}, "largest between 0 and 0.5"),
     ],
 )
-def test_wrong_options_are_reported_in_one_line(options: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=said) as caught:
+def test_wrong_options_are_reported_in_one_line(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
         MeasuredModesStudy(**options)
     assert "\n" not in str(caught.value)
 
 
-def test_a_base_that_has_not_buckled_is_reported(subject: ImagePairSpec, tmp_path: Path) -> None:
+def test_a_base_that_has_not_buckled_is_reported(spec: ImagePairSpec, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"buckled at 7.8 %, got one with 9.6\d* % as its"):
-        MeasuredModesStudy(strain=0.078).prepare(subject, tmp_path)
-    tilted = replace(subject, experiment=replace(subject.experiment, tilt=0.01))
+        MeasuredModesStudy(strain=0.078).prepare(spec, tmp_path)
+    tilted = replace(spec, experiment=replace(spec.experiment, tilt=0.01))
     with pytest.raises(InputError, match="perfect specimen"):
         MeasuredModesStudy().prepare(tilted, tmp_path)
 
 
-def test_gradings_too_steep_are_reported(subject: ImagePairSpec, tmp_path: Path) -> None:
+def test_gradings_too_steep_are_reported(spec: ImagePairSpec, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="make diameters or gradings smaller"):
-        MeasuredModesStudy(gradings_x=(0.2,)).prepare(subject, tmp_path)
+        MeasuredModesStudy(gradings_x=(0.2,)).prepare(spec, tmp_path)

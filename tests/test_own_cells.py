@@ -115,7 +115,7 @@ def vars_of(mesh: Mesh) -> tuple[Any, Any]:
     return mesh.nodes, mesh.cells
 
 
-def test_nodes_upon_each_other_are_said(tmp_path: Path) -> None:
+def test_nodes_upon_each_other_are_reported(tmp_path: Path) -> None:
     """One element has its own copy of a mid-side inside: the mesh is cut open there."""
     nodes, cells = SQUARE.mesh.nodes, SQUARE.mesh.cells.copy()
     inside = next(

@@ -365,7 +365,7 @@ def changed_experiment(case: Path, **options: Any) -> Case:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"strains": (0.05,)}, r"snapshots at strains 0\.05, got 0\.08, 0\.15"),
         ({"strains": (0.08, 0.12)}, r"snapshots at strains 0\.08, 0\.12, got 0\.08, 0\.15"),
@@ -379,15 +379,15 @@ def changed_experiment(case: Path, **options: Any) -> Case:
     ],
 )
 def test_a_solution_of_another_experiment_is_refused(
-    case: Path, folder: Path, tmp_path: Path, options: dict[str, Any], said: str
+    case: Path, folder: Path, tmp_path: Path, options: dict[str, Any], message: str
 ) -> None:
     other, solution = changed_experiment(case, **options), folder / "solution.h5"
     for pipeline in (Run(other, folder), Run(other, tmp_path / "new", solution=solution)):
-        with pytest.raises(InputError, match=f"{said}.* in {solution}") as error:
+        with pytest.raises(InputError, match=f"{message}.* in {solution}") as error:
             pipeline.image()
         assert "\n" not in str(error.value)
     if "branches" not in options:  # what was imaged is of the branch that was asked for then
-        with pytest.raises(InputError, match=f"{said}.* in images in .*'modeharvest image'"):
+        with pytest.raises(InputError, match=f"{message}.* in images in .*'modeharvest image'"):
             Run(other, folder).correlate()
 
 
@@ -453,9 +453,9 @@ def test_a_full_disk_leaves_nothing_that_looks_finished(
     """No file may grow beyond 200 kB: the solution fits, an image does not."""
     with no_file_beyond(200_000):
         assert command(monkeypatch, "run", case, "--out", tmp_path / "out") == 2
-    said = capsys.readouterr().err
-    assert "error: could not write" in said
-    assert "Traceback" not in said
+    message = capsys.readouterr().err
+    assert "error: could not write" in message
+    assert "Traceback" not in message
     left = {str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*.*")}
     assert "solution.h5" in left
     assert not {"summary.json", "report.html", "images/images.json"} & left

@@ -95,7 +95,7 @@ def test_no_point_is_missing_and_none_is_found_outside() -> None:
     nodes, cells = patch(n, 0, 0.0)
     shift = 0.2 * np.stack([np.sin(2 * nodes[:, 1]), np.cos(2 * nodes[:, 0])], axis=1)
     interior = ((nodes > 0.01) & (nodes < n - 0.01)).all(axis=1)
-    nodes = nodes + 0.5 * interior[:, None] * shift  # bulged within a straight outline
+    nodes = nodes + 0.5 * interior[:, None] * shift  # bulged within a straight boundary
     x, y = rng.uniform(-0.3, n + 0.3, (2, 300, 300))
     found = locate_points(nodes, cells, "T6", GRID, *GRID.to_px(x, y))
     square = (np.minimum(x, y) >= 0.0) & (np.maximum(x, y) <= n)

@@ -112,7 +112,7 @@ def test_words_are_escaped(text: str) -> None:
     assert "<for tests>" not in text
 
 
-def test_what_was_missed_is_said(text: str) -> None:
+def test_what_was_missed_is_reported(text: str) -> None:
     assert text.count("✗ missed") == 1
     assert text.count("✓ met") == 1
     missed = "Missed 1 of 2 expected values: best fit: expected at most 1, obtained 1.5 px."
@@ -183,7 +183,7 @@ def test_what_is_drawn_before_the_numbers_is_what_the_page_shows(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"negative_pivots": 2}, "the state is unstable (2 negative pivots)"),
         ({"outcome": "stagnated", "outcome_why": "No step."}, "ended as “stagnated”: No step."),
@@ -191,13 +191,13 @@ def test_what_is_drawn_before_the_numbers_is_what_the_page_shows(tmp_path: Path)
         ({"pattern_inner_px": 0.2}, "no pattern is observable"),
     ],
 )
-def test_a_snapshot_to_be_wary_of_is_named(change: dict[str, Any], said: str) -> None:
+def test_a_snapshot_to_be_wary_of_is_named(change: dict[str, Any], message: str) -> None:
     data = made_up.data((0.1,))
     summary = made_up.summary(data)
     summary["snapshots"][0] |= {"pattern_inner_px": 3.0}
-    assert not any(said in note for note in notes(summary))
+    assert not any(message in note for note in notes(summary))
     summary["snapshots"][0] |= change
-    assert any(note.startswith("At 10 %") and said in note for note in notes(summary))
+    assert any(note.startswith("At 10 %") and message in note for note in notes(summary))
 
 
 @pytest.mark.parametrize(

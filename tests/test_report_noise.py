@@ -89,7 +89,7 @@ def summary(**snapshot: Any) -> dict[str, Any]:
 
 
 def note(made: dict[str, Any], about: str) -> str:
-    (found,) = (said for said in notes(made) if about in said)
+    (found,) = (message for message in notes(made) if about in message)
     return found
 
 
@@ -115,7 +115,7 @@ def test_what_standard_errors_mean_depends_on_the_images() -> None:
 def test_a_fixed_mode_has_no_parameters_off_the_ideal() -> None:
     fixed = summary(mode=[], mode_deviation_percent=[])
     assert "Fixed at the ideal pattern" in note(fixed, "no pattern is observable")
-    assert not any("nan" in said for said in notes(fixed))
+    assert not any("nan" in message for message in notes(fixed))
     (key,) = (k for k in key_numbers(fixed) if k.name == "deviation of the mode")
     assert (key.value, key.remark) == (None, "fixed at the ideal pattern")
     assert "% off the ideal" in note(summary(), "no pattern is observable")

@@ -114,8 +114,8 @@ def test_noise_and_model_error_are_distinguished_whatever_the_speckle(
 
 def test_lags_of_the_paper_s_speckle() -> None:
     assert lags_for(12.4) == LAGS_PX
-    said = ResidualTest(0.5, 1000, lags_px=lags_for(4.0)).text
-    assert "autocorrelation over 3 to 4 px" in said
+    message = ResidualTest(0.5, 1000, lags_px=lags_for(4.0)).text
+    assert "autocorrelation over 3 to 4 px" in message
 
 
 def test_decorrelated_blocks_are_counted() -> None:
@@ -157,7 +157,7 @@ def test_a_strong_mode_is_observable() -> None:
     assert 0 < low.overlap[0] < 0.9 < seen.overlap[0] < 1
     u = result.fluctuation()[MASK] / GRID.pixel_size
     assert seen.amplitude_px[0] == pytest.approx(np.sqrt((u**2).mean()), rel=0.05)
-    # The leftover is the residual over the gradient of the noisy image, at any positions.
+    # The model error is the residual over the gradient of the noisy image, at any positions.
     g = case()[3] + NOISE * np.random.default_rng(5).normal(size=(2, *GRID.shape))[1]
     rows, cols = np.nonzero(MASK)
     moved = np.random.default_rng(6).uniform(-0.5, 0.5, size=(2, rows.size))
@@ -175,7 +175,7 @@ def test_worst_combination_is_an_eigenvector_of_the_scaled_matrix() -> None:
     assert "eigenvalue" in str(worst)
 
 
-def test_without_a_pattern_the_mode_is_said_to_be_unobservable() -> None:
+def test_without_a_pattern_the_mode_is_reported_to_be_unobservable() -> None:
     """A smooth displacement that the ansatz lacks a part of, as before buckling."""
     ansatz = manufactured.one_mode()
     cubic = Ansatz(ansatz.domain, v0_degree=3)

@@ -151,8 +151,8 @@ def test_a_star_by_command(
         return int(exited.value.code or 0)
 
     assert run("--rows", "31", "--cols", "100", "--noise", "0.01", "--noise", "0.03") == 0
-    said = capsys.readouterr().out
-    assert "8 images of 31 x 100 px" in said
+    message = capsys.readouterr().out
+    assert "8 images of 31 x 100 px" in message
     assert StarSet.read(tmp_path / "s").spec.noise == (0.01, 0.03)
     assert run("--rows", "30") == 2
     predicted = capsys.readouterr().err
@@ -297,7 +297,7 @@ def test_two_codes_from_their_files_to_the_report(
     assert len((out / "resolution.csv").read_text("utf-8").splitlines()) == 3
 
 
-def test_what_can_t_be_graded_is_said_in_a_line(star_set: StarSet, tmp_path: Path) -> None:
+def test_what_can_t_be_graded_is_reported_in_a_line(star_set: StarSet, tmp_path: Path) -> None:
     row, col = np.indices((SMALL.rows, SMALL.cols))
     v = SMALL.down(row, col)
 

@@ -41,7 +41,7 @@ SPECIMEN = Specimen(holes_x=4, holes_y=4)
 
 
 @pytest.fixture(scope="module")
-def subject() -> ResolutionSpec:
+def spec() -> ResolutionSpec:
     """A small specimen on images of 260 x 260 px."""
     buckled = BuckledMotion(
         SPECIMEN, SquareLatticeOptions(), SpeckleSpec(blur_px=2.0), PIXEL, 0.1, 5.0
@@ -50,8 +50,8 @@ def subject() -> ResolutionSpec:
 
 
 @pytest.fixture(scope="module")
-def curves(subject: ResolutionSpec) -> TransferCurves:
-    return TransferCurves.of(subject, (1, 2, 3))
+def curves(spec: ResolutionSpec) -> TransferCurves:
+    return TransferCurves.of(spec, (1, 2, 3))
 
 
 # -- best fits ----------------------------------------------------------------------------
@@ -80,9 +80,9 @@ def test_on_a_full_rectangle_the_transfer_is_bessel_s(degree: int, axis: int) ->
     assert both == pytest.approx(expected, abs=1e-3)
 
 
-def test_the_tangent_is_what_fit_displacement_does_to_small_waves(subject: ResolutionSpec) -> None:
+def test_the_tangent_is_what_fit_displacement_does_to_small_waves(spec: ResolutionSpec) -> None:
     """The fit's own curvature is what 1e-4 mm of wave leave of the difference."""
-    buckled, degree = subject.buckled, 2
+    buckled, degree = spec.buckled, 2
     grid = PixelGrid.centred(131, 131, 0.1)
     at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
     mask = buckled.material(at[..., 0], at[..., 1])
@@ -96,9 +96,9 @@ def test_the_tangent_is_what_fit_displacement_does_to_small_waves(subject: Resol
         assert wave_share(change, wave[mask][..., None]) == pytest.approx(expected, abs=1e-3)
 
 
-def test_waves_that_the_ansatz_describes_are_found_whole(subject: ResolutionSpec) -> None:
+def test_waves_that_the_ansatz_describes_are_found_whole(spec: ResolutionSpec) -> None:
     """Degree by degree less is lost, and long waves come back; nothing goes to the other part."""
-    curves = TransferCurves.of(subject, (1, 4))
+    curves = TransferCurves.of(spec, (1, 4))
     for part in WAVED:
         for axis in range(len(AXES)):
             assert (curves.own[part, axis, 4] > curves.own[part, axis, 1] - 0.02).all()
@@ -109,8 +109,8 @@ def test_waves_that_the_ansatz_describes_are_found_whole(subject: ResolutionSpec
     assert resolved < 0.05
 
 
-def test_the_pattern_is_tuned_and_not_filtered(subject: ResolutionSpec) -> None:
-    band = Passband.of(subject, 2)
+def test_the_pattern_is_tuned_and_not_filtered(spec: ResolutionSpec) -> None:
+    band = Passband.of(spec, 2)
     mode = int(np.argmin(np.abs(band.stretch - 1.0)))
     assert band.added[mode] == pytest.approx(1.0, abs=1e-9)
     near = np.abs(band.stretch - 1.0) < 0.05
@@ -124,8 +124,8 @@ def test_the_pattern_is_tuned_and_not_filtered(subject: ResolutionSpec) -> None:
 # -- images -------------------------------------------------------------------------------
 
 
-def test_images_of_a_formula_are_exact(subject: ResolutionSpec) -> None:
-    buckled = subject.buckled
+def test_images_of_a_formula_are_exact(spec: ResolutionSpec) -> None:
+    buckled = spec.buckled
     for wave in (None, AddedWave("v1", 1, 4.0, 0.2, 0.02)):
         base = buckled._base
         points = base.points if wave is None else buckled._improved(base, wave)
@@ -140,8 +140,8 @@ def test_images_of_a_formula_are_exact(subject: ResolutionSpec) -> None:
     assert buckled.displacement(at) == pytest.approx(ansatz.displacement_at(a, at))
 
 
-def test_material_is_what_the_specimen_is(subject: ResolutionSpec) -> None:
-    buckled, s = subject.buckled, SPECIMEN
+def test_material_is_what_the_specimen_is(spec: ResolutionSpec) -> None:
+    buckled, s = spec.buckled, SPECIMEN
     area = buckled.material(*np.meshgrid(buckled.grid.x, buckled.grid.y)).sum() * PIXEL**2
     holes = 16 * np.pi * (0.5 * s.diameter) ** 2
     assert area == pytest.approx(4.0 * np.prod(s.half_size) - holes, rel=0.01)
@@ -150,7 +150,7 @@ def test_material_is_what_the_specimen_is(subject: ResolutionSpec) -> None:
 
 
 @pytest.fixture(scope="module")
-def table(subject: ResolutionSpec, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+def table(spec: ResolutionSpec, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     """All cases of a small study, run here."""
     folder = tmp_path_factory.mktemp("resolution")
     experiment = Experiment(
@@ -169,22 +169,22 @@ def table(subject: ResolutionSpec, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def test_images_give_what_best_fits_promise(
-    table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves
+    table: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
 ) -> None:
     """The speckle's gradient weighs the fit, by grain: some 700 grains share 10 unknowns.
 
     So what is lost, a tenth of the power, comes back in part by chance: with a standard deviation
     of sqrt(10 / 700) sqrt(0.1) = 0.04 of the wave.
     """
-    waves = measured_waves(table, subject, curves)
+    waves = measured_waves(table, spec, curves)
     assert len(waves) == len(WAVED) * len(AXES)
     assert waves["difference"].abs().max() < 3.5 * 0.04
     assert abs(waves["difference"].mean()) < 3.5 * 0.04 / np.sqrt(len(waves))
     assert waves["best fit"].to_numpy() == pytest.approx(0.9, abs=1e-3)  # that is what l10 is
 
 
-def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: ResolutionSpec) -> None:
-    floors = noise_floors(table, subject)
+def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, spec: ResolutionSpec) -> None:
+    floors = noise_floors(table, spec)
     assert len(floors) == 2 * len(QUANTITIES)
     z = (floors["Monte Carlo / predicted"] - 1.0) / floors["±"]
     # Twelve realisations: Student's t, and eight numbers that hang together.
@@ -193,9 +193,9 @@ def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: Resol
 
 
 def test_findings_of_a_resolution_study(
-    table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves
+    table: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
 ) -> None:
-    found = report_resolution(ResolutionAnalysis.of(table, subject, curves), "seed 0")
+    found = report_resolution(ResolutionAnalysis.of(table, spec, curves), "seed 0")
     degrees = found.numbers["degrees"]
     finest = [d["finest_px"]["v0 x"] for d in degrees]
     floor = [d["floor_px"]["v0"] for d in degrees]

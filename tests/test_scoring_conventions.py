@@ -119,8 +119,8 @@ def test_a_field_read_by_another_convention_is_put_right(
     truth = true_motion(size)
     columns = convention.write(*measured(truth, NOISE_PX, seed))
     field = declared(columns, down, convention.in_mm)
-    meant, said = check_conventions(field, truth, GRID)
-    assert bool(said) == bool(meant.text)
+    meant, message = check_conventions(field, truth, GRID)
+    assert bool(message) == bool(meant.text)
     left = median_px(truth, *meant.applied(field.x, field.y, field.u))
     # As little as the noise leaves: of 1300 points the median is known to 2 %; a shift that is
     # not seen, because it changes nothing to speak of, may add a thousandth of a pixel.
@@ -147,8 +147,8 @@ NAMED = {
 def test_one_wrong_convention_is_named(words: str) -> None:
     truth = true_motion(1.0)
     field = declared(NAMED[words].write(*measured(truth, NOISE_PX)), down=True, in_mm=False)
-    meant, (said,) = check_conventions(field, truth, GRID)
-    assert words in said
+    meant, (message,) = check_conventions(field, truth, GRID)
+    assert words in message
     assert len(meant.text) == 1
 
 
@@ -158,8 +158,8 @@ def test_positions_from_a_corner_are_named(corner: tuple[int, int]) -> None:
     x, y, u = measured(truth, NOISE_PX)
     x0, y0 = GRID.to_mm(*corner)
     field = LocalField(x - x0, y - y0, u)
-    _, (said,) = check_conventions(field, truth, GRID)
-    assert f"from the {'upper' if corner == (0, 0) else 'lower'} left pixel" in said
+    _, (message,) = check_conventions(field, truth, GRID)
+    assert f"from the {'upper' if corner == (0, 0) else 'lower'} left pixel" in message
 
 
 def smooth(length_px: float) -> FloatArray:

@@ -79,13 +79,15 @@ def run(
 ) -> tuple[str, int]:
     arguments = ["score", *fields, "--truth", truth.folder, "--strain", STRAIN]
     patch.setattr(sys, "argv", ["modeharvest", *map(str, arguments), "--out", str(folder / "out")])
-    said: list[str] = []
-    patch.setattr("rich.console.Console.print", lambda _, *what, **how: said.extend(map(str, what)))
+    message: list[str] = []
+    patch.setattr(
+        "rich.console.Console.print", lambda _, *what, **how: message.extend(map(str, what))
+    )
     try:
         main()
     except SystemExit as end:
-        return "\n".join(said), int(end.code or 0)
-    return "\n".join(said), 0
+        return "\n".join(message), int(end.code or 0)
+    return "\n".join(message), 0
 
 
 def test_the_best_comes_first_and_the_sparse_last(truth: BenchmarkTruth) -> None:
@@ -97,7 +99,7 @@ def test_the_best_comes_first_and_the_sparse_last(truth: BenchmarkTruth) -> None
 
 
 def test_files_and_page_tell_the_same(command: tuple[Path, str, int]) -> None:
-    folder, said, code = command
+    folder, message, code = command
     assert code == 0
     summary = json.loads((folder / "out" / "scores.json").read_text("utf-8"))
     assert [field["name"] for field in summary["fields"]] == ["good", "fair", "sparse"]
@@ -111,9 +113,9 @@ def test_files_and_page_tell_the_same(command: tuple[Path, str, int]) -> None:
         (row,) = (r for r in rows if (r["field"], r["region"]) == (field["name"], "everywhere"))
         assert float(row["rms [px]"]) == pytest.approx(rms, rel=1e-5)
         assert number(rms, 3) in page
-    assert "sparse covers" in said
+    assert "sparse covers" in message
     assert "sparse covers" in page
-    assert "report.html" in said
+    assert "report.html" in message
 
 
 def test_no_number_is_not_a_number_in_json(command: tuple[Path, str, int]) -> None:
@@ -156,9 +158,9 @@ def test_a_perfect_field_alone_gets_its_page(
     x, y, u = made.points(truth)
     np.savez(tmp_path / "exact.npz", **{"x [mm]": x, "y up [mm]": y, "u [mm]": u[:, 0],
                                         "v up [mm]": u[:, 1]})  # fmt: skip
-    said, code = run(monkeypatch, tmp_path, truth, [tmp_path / "exact.npz"])
+    message, code = run(monkeypatch, tmp_path, truth, [tmp_path / "exact.npz"])
     assert code == 0
-    assert "that all cover" not in said
+    assert "that all cover" not in message
     text = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert Page(text).open == []
     assert "where all measure" not in text
@@ -187,9 +189,9 @@ def test_a_field_that_lost_all_of_the_material_gets_its_page(
 def test_bad_input_is_one_line(
     truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said, code = run(monkeypatch, tmp_path, truth, [tmp_path / "none.csv"])
+    message, code = run(monkeypatch, tmp_path, truth, [tmp_path / "none.csv"])
     assert code == 2
-    assert re.search(r"error:.*none\.csv", said)
+    assert re.search(r"error:.*none\.csv", message)
     assert not (tmp_path / "out" / "report.html").exists()
 
 
@@ -200,10 +202,10 @@ def test_fields_that_cannot_be_graded_do_not_stop_the_others(
     write_field(tmp_path / "good.csv", noisy(truth, 0.01, "good"))
     (tmp_path / "bad.csv").write_text("nothing", "utf-8")
     fields = [tmp_path / "bad.csv", tmp_path / "good.csv", tmp_path / "none.csv"]
-    said, code = run(monkeypatch, tmp_path, truth, fields)
+    message, code = run(monkeypatch, tmp_path, truth, fields)
     assert code == 2
     for name in ("bad", "none"):
-        assert re.search(rf"error:.*{name}\.csv", said)
+        assert re.search(rf"error:.*{name}\.csv", message)
     summary = json.loads((tmp_path / "out" / "scores.json").read_text("utf-8"))
     assert [field["name"] for field in summary["fields"]] == ["good"]
     assert list(summary["refused"]) == [str(fields[0]), str(fields[2])]
@@ -217,9 +219,9 @@ def test_displacements_in_another_unit_are_refused(
     for factor, words in ((1 / PIXEL, "pixels had been declared as mm"),
                           (PIXEL, "mm had been declared as pixels")):  # fmt: skip
         write_field(tmp_path / "it.csv", replace(field, u=factor * field.u))
-        said, code = run(monkeypatch, tmp_path, truth, [tmp_path / "it.csv"])
+        message, code = run(monkeypatch, tmp_path, truth, [tmp_path / "it.csv"])
         assert code == 2
-        assert words in said
+        assert words in message
 
 
 @pytest.mark.parametrize("length_px", [12.0, 30.0])

@@ -194,8 +194,8 @@ def test_a_fixed_folder_is_refused_with_its_holder_and_free_afterwards(tmp_path:
     with locked_elsewhere(tmp_path) as other:
         with pytest.raises(InputError) as error, exclusive(tmp_path):
             pass
-        said = f"process {other.pid} on {socket.gethostname()}, since 20"
-        assert said in str(error.value)
+        message = f"process {other.pid} on {socket.gethostname()}, since 20"
+        assert message in str(error.value)
         assert "modeharvest run 'a case'; wait until that ends" in str(error.value)
         assert "\n" not in str(error.value)
         with exclusive(tmp_path / "sub"):
@@ -216,14 +216,14 @@ def test_the_system_gives_the_folder_back_when_its_holder_is_killed(tmp_path: Pa
 
 
 def test_the_same_thread_may_ask_again_and_another_may_not(tmp_path: Path) -> None:
-    said: list[str] = []
+    message: list[str] = []
 
     def ask() -> None:
         try:
             with exclusive(tmp_path):
-                said.append("had it")
+                message.append("had it")
         except InputError as error:
-            said.append(str(error))
+            message.append(str(error))
 
     thread = threading.Thread(target=ask)
     with exclusive(tmp_path):
@@ -231,9 +231,9 @@ def test_the_same_thread_may_ask_again_and_another_may_not(tmp_path: Path) -> No
             pass
         thread.start()
         thread.join()
-    assert f"process {os.getpid()}" in said[0]
+    assert f"process {os.getpid()}" in message[0]
     ask()
-    assert said[1] == "had it"
+    assert message[1] == "had it"
 
 
 @pytest.mark.parametrize(

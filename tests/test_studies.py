@@ -58,7 +58,7 @@ pixel_size = 0.05
 
 
 @pytest.fixture(scope="module")
-def subject() -> ImagePairSpec:
+def spec() -> ImagePairSpec:
     """The paper's specimen on images of 0.05 mm/px, which take a tenth of a second."""
     case = StudyCase()
     assert PAPER is not None
@@ -127,9 +127,9 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
         parts.append(part.assign(radius=radius))
     table = pd.concat(parts, ignore_index=True)
     found = report_robustness(RobustnessStudy().analyse(table, Path()), "seed 0")
-    (said,) = [s for s in found.text if "All initial guesses converge" in s]
-    assert "up to 10 % off" in said
-    assert "50 %: 1 of 4" in said
+    (message,) = [s for s in found.text if "All initial guesses converge" in s]
+    assert "up to 10 % off" in message
+    assert "50 %: 1 of 4" in message
     basin = frame(found.tables, "Basin of convergence")
     assert list(basin["same minimum"]) == [4, 4, 3, 4, 1]
     assert list(basin["other minima detected"]) == [
@@ -141,17 +141,17 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
     ]
 
 
-def test_one_start_against_a_calculation_of_its_own(subject: ImagePairSpec, folder: Path) -> None:
+def test_one_start_against_a_calculation_of_its_own(spec: ImagePairSpec, folder: Path) -> None:
     study = RobustnessStudy(initial_guesses=1, radii=(), strain_errors=(-0.5,))
-    near, far = study.prepare(subject, folder)
+    near, far = study.prepare(spec, folder)
     found = one_start(near, folder)
-    scene = VirtualImagePair.open(folder, near["images"])
-    nominal = scene.correlate()
-    start = scene.initial_guess()
+    pair = VirtualImagePair.open(folder, near["images"])
+    nominal = pair.correlate()
+    start = pair.initial_guess()
     unit = np.random.default_rng([0, 0]).uniform(-1.0, 1.0, 7)
-    start[scene.ansatz.phi_slice(0)] += 0.1 * unit * np.array([1] * 5 + [1.9] * 2)
-    end = scene.correlate(start)
-    u, other = (r.displacement()[::4, ::4][scene.mask[::4, ::4]] / 0.05 for r in (nominal, end))
+    start[pair.ansatz.phi_slice(0)] += 0.1 * unit * np.array([1] * 5 + [1.9] * 2)
+    end = pair.correlate(start)
+    u, other = (r.displacement()[::4, ::4][pair.mask[::4, ::4]] / 0.05 for r in (nominal, end))
     norm, other_norm = np.linalg.norm(u), np.linalg.norm(other)
     epsilon = 100.0 * abs(norm - other_norm) / norm
     assert found["epsilon_percent"] == pytest.approx(epsilon, rel=1e-6, abs=1e-12)
@@ -213,12 +213,12 @@ def test_what_no_noise_moves_does_not_count() -> None:
 
 
 def test_without_a_residual_the_cost_is_as_stiff_as_gauss_and_newton_say(
-    subject: ImagePairSpec, folder: Path
+    spec: ImagePairSpec, folder: Path
 ) -> None:
     """And softer with one, if only a little where w is short against a speckle."""
-    scene = VirtualImagePair.open(folder, subject.describe(folder, 0.128))
-    result = scene.correlate()
-    seen = scene.matched(result)
+    pair = VirtualImagePair.open(folder, spec.describe(folder, 0.128))
+    result = pair.correlate()
+    seen = pair.matched(result)
     # Chosen at the end itself, not a step before it.
     assert seen.used.sum() == pytest.approx(result.pixels, rel=0.01)
     without_residual = noise_causes.zero_residual(seen)
@@ -233,11 +233,11 @@ def test_without_a_residual_the_cost_is_as_stiff_as_gauss_and_newton_say(
 
 
 def test_noise_study_on_tiny_images(
-    subject: ImagePairSpec, folder: Path, monkeypatch: pytest.MonkeyPatch
+    spec: ImagePairSpec, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noise_causes, "EXAMPLES", 3)
     study = NoiseStudy(levels=(0.002,), pairs=2)
-    cases = study.prepare(subject, folder)
+    cases = study.prepare(spec, folder)
     assert len(cases) == 5
     rows = [{**case, "error": "", **one_realisation(case, folder)} for case in cases]
     found = report_noise(study.analyse(pd.DataFrame(rows), folder), study.seeds)
@@ -259,13 +259,13 @@ def test_noise_study_on_tiny_images(
 # -- systematic errors --------------------------------------------------------------------
 
 
-def test_systematic_study_on_tiny_images(subject: ImagePairSpec, folder: Path) -> None:
+def test_systematic_study_on_tiny_images(spec: ImagePairSpec, folder: Path) -> None:
     study = SystematicStudy(
         factors=("order", "gradient", "bits"),
         levels={"bits": (2, 10), "gradient": ("reference", "deformed")},
         seeds_of_speckle=(0,),
     )
-    cases = study.prepare(subject, folder)  # the base leaves order and gradient to the images
+    cases = study.prepare(spec, folder)  # the base leaves order and gradient to the images
     factors = ["base", *["order"] * 3, *["gradient"] * 2, *["bits"] * 2]
     assert [c["factor"] for c in cases] == factors
     rows = [{**case, "error": "", **one_level(case, folder)} for case in cases]
@@ -322,7 +322,7 @@ def test_a_quick_study_is_smaller() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ('[study]\nkind = "robustnes"', "kind among"),
         ("[study]\ninitial_guess = 3", "did you mean 'initial_guesses"),
@@ -345,19 +345,19 @@ def test_a_quick_study_is_smaller() -> None:
         ("[experiment]", "expected a table [study]"),
     ],
 )
-def test_a_wrong_study_is_reported_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_study_is_reported_in_one_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "study.toml"
     path.write_text(text, "utf-8")
     with pytest.raises(InputError) as caught:
         StudyCase.read(path)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_levels_out_of_range_are_reported_before_anything_runs(
-    subject: ImagePairSpec, folder: Path
+    spec: ImagePairSpec, folder: Path
 ) -> None:
-    for name, level, said in (
+    for name, level, message in (
         ("order", 4.5, "whole numbers"),
         ("order", 4, "order 3, 5 or 11"),
         ("gradient", 3, "one of .*'reference'"),
@@ -365,17 +365,15 @@ def test_levels_out_of_range_are_reported_before_anything_runs(
         ("speckle_size", 0.0, "above 0 times"),
         ("fill_factor", 2.0, "fill factor of 0"),
     ):
-        with pytest.raises(InputError, match=said):
-            SystematicStudy(factors=(name,), levels={name: (level,)}).prepare(subject, folder)
+        with pytest.raises(InputError, match=message):
+            SystematicStudy(factors=(name,), levels={name: (level,)}).prepare(spec, folder)
 
 
-def test_a_solution_of_another_experiment_is_not_taken(
-    subject: ImagePairSpec, tmp_path: Path
-) -> None:
-    name = subject.describe(tmp_path, 0.128)
+def test_a_solution_of_another_experiment_is_not_taken(spec: ImagePairSpec, tmp_path: Path) -> None:
+    name = spec.describe(tmp_path, 0.128)
     (tmp_path / "solution.h5").unlink()
-    first = subject.solution.snapshots[0]
-    other = replace(subject.solution, snapshots=(replace(first, nominal_strain=0.128),))
+    first = spec.solution.snapshots[0]
+    other = replace(spec.solution, snapshots=(replace(first, nominal_strain=0.128),))
     other.write(tmp_path / "solution.h5")
     with pytest.raises(InputError, match="found another"):
         VirtualImagePair.open(tmp_path, name)
@@ -412,7 +410,7 @@ def test_a_study_from_the_command_line(
 def test_a_folder_with_something_else_is_not_taken(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    for name, content, said in (
+    for name, content, message in (
         ("study.json", {"kind": "noise"}, "which holds a noise study"),
         ("summary.json", {}, "which holds something that is no study"),
     ):
@@ -422,7 +420,7 @@ def test_a_folder_with_something_else_is_not_taken(
         assert called(monkeypatch, "study", tmp_path / "tiny.toml", "--out", out) == 2
         rows = capsys.readouterr().err.splitlines()
         (line,) = [row for row in rows if row.startswith("error:")]
-        assert said in line
+        assert message in line
         assert [path.name for path in out.iterdir()] == [name]  # nothing was touched
 
 
@@ -481,7 +479,7 @@ def check_page(text: str, summary: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("robustnes",), "did you mean 'robustness'"),
         (("robustness", "--workers", "2", "--scheduler", "tcp://x:1"), "got both"),
@@ -500,11 +498,11 @@ def test_a_wrong_command_is_reported_in_one_line(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     arguments: tuple[str, ...],
-    said: str,
+    message: str,
 ) -> None:
     out = tmp_path / "out"
     assert called(monkeypatch, "study", *arguments, "--out", out) == 2
-    assert said in error_line(capsys)
+    assert message in error_line(capsys)
     assert not out.exists()
 
 
@@ -517,6 +515,6 @@ def test_workers_are_counted(
 ) -> None:
     out = tmp_path / "out"
     assert called(monkeypatch, "study", "robustness", "--workers", workers, "--out", out) == 2
-    assert "Traceback" not in (said := capsys.readouterr().err)
-    assert "--workers" in said
+    assert "Traceback" not in (message := capsys.readouterr().err)
+    assert "--workers" in message
     assert not out.exists()

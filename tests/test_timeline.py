@@ -37,13 +37,13 @@ def test_an_unloading_is_not_taken_for_a_loading() -> None:
 
 
 @pytest.mark.parametrize("strains", [(), (0.02, 0.05)])
-def test_no_pattern_is_said(strains: tuple[float, ...]) -> None:
+def test_no_pattern_is_reported(strains: tuple[float, ...]) -> None:
     found = find_buckling([moment(e) for e in strains])
     assert np.isnan(found.after)
     assert "No image" in found.text
 
 
-def test_a_pattern_from_the_beginning_is_said() -> None:
+def test_a_pattern_from_the_beginning_is_reported() -> None:
     found = find_buckling([moment(e) for e in (0.1, 0.12)])
     assert np.isnan(found.before)
     assert "Every image" in found.text

@@ -1,7 +1,7 @@
 """The parts of an error, apart from each other, and the regions of the pattern.
 
 Guards: the conventions of rms; a best fit that nothing of the same ansatz beats; that model and
-measurement error add up to w; the largest pattern, by region; the exact outline of a mesh.
+measurement error add up to w; the largest pattern, by region; the exact boundary of a mesh.
 """
 
 from __future__ import annotations

@@ -147,7 +147,7 @@ def test_energy_where_nothing_can_be_is_missing() -> None:
     assert JetMatrix(folded)[0, 0].value[0] == -0.1
 
 
-def test_what_is_missing_is_said(mesh: Mesh) -> None:
+def test_what_is_missing_is_reported(mesh: Mesh) -> None:
     result = affine(mesh, np.eye(2))
     with pytest.raises(InputError, match="expected a material for the field 'cauchy'"):
         result.field("cauchy")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import riley_side
 from laps import in_turn, use_threads
-from meshes import ELEMENTS, Scene, aligned, bulged, specimen
+from meshes import ELEMENTS, MeshView, aligned, bulged, specimen
 
 from modeharvest.imaging.mapping.isoparametric import locate
 
@@ -36,48 +36,48 @@ def rows(quick: bool) -> dict[str, dict[str, Any]]:
 def measure(options: dict[str, Any]) -> dict[str, Any]:
     """One row of the table."""
     use_threads(options["threads"])
-    scene = _scene(options)
-    nodes, mesh = scene.mesh.nodes, scene.mesh
+    view = _view(options)
+    nodes, mesh = view.mesh.nodes, view.mesh
     three = np.column_stack([nodes, np.ones(len(nodes))])
 
     laps = in_turn(
         {
-            "locate": lambda: locate(scene.deformed, mesh.cells, mesh.element, scene.grid),
+            "locate": lambda: locate(view.deformed, mesh.cells, mesh.element, view.grid),
             "map back": lambda: locate(
-                scene.deformed, mesh.cells, mesh.element, scene.grid, nodal=nodes
+                view.deformed, mesh.cells, mesh.element, view.grid, nodal=nodes
             ),
-            "riley, three fields": riley_side.nodal(scene, three, options["threads"]),
-            "riley, one field": riley_side.nodal(scene, nodes[:, :1], options["threads"]),
+            "riley, three fields": riley_side.nodal(view, three, options["threads"]),
+            "riley, one field": riley_side.nodal(view, nodes[:, :1], options["threads"]),
         },
         options["laps"],
     )
     located, ours = laps["locate"].result, laps["map back"].result
     theirs = laps["riley, three fields"].result
     return {
-        "mesh": scene.name,
+        "mesh": view.name,
         "element": mesh.element,
         "cells": len(mesh.cells),
-        "shape": scene.grid.shape,
+        "shape": view.grid.shape,
         "threads": options["threads"],
         "seconds": {name: lap.median_s for name, lap in laps.items()},
         "first_s": {name: lap.first_s for name, lap in laps.items()},
-        **compare(scene, located.mask, ours.values, theirs),
+        **compare(view, located.mask, ours.values, theirs),
         "residual_px": located.max_residual_px,
     }
 
 
-def _scene(options: dict[str, Any]) -> Scene:
+def _view(options: dict[str, Any]) -> MeshView:
     if "element" not in options:
         return specimen(options["rows"])
     make = {"bulged": bulged, "aligned": aligned}[options["kind"]]
     return make(options["element"], options["rows"])
 
 
-def compare(scene: Scene, mask: Any, point: Any, theirs: Any) -> dict[str, Any]:
+def compare(view: MeshView, mask: Any, point: Any, theirs: Any) -> dict[str, Any]:
     """Where both see material, how far apart are the points; and who sees more."""
     covered = theirs[0] != riley_side.BACKGROUND
     both = mask & covered
-    apart = np.hypot(theirs[0] - point[0], theirs[1] - point[1])[both] / scene.grid.pixel_size
+    apart = np.hypot(theirs[0] - point[0], theirs[1] - point[1])[both] / view.grid.pixel_size
     return {
         "material_px": int(mask.sum()),
         "apart_max_px": float(apart.max()),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import riley_side
 from laps import Work, in_turn, use_threads
-from meshes import Scene, specimen
+from meshes import MeshView, specimen
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -45,21 +45,21 @@ def rows(quick: bool) -> dict[str, dict[str, Any]]:
 def measure(options: dict[str, Any]) -> dict[str, Any]:
     """All contestants on one image."""
     use_threads(options["threads"])
-    scene = specimen(options["rows"])
-    speckle = Speckle(SpeckleSpec(), scene.grid.shape)
-    contestants: dict[str, Work] = {OURS: lambda: exact(scene, speckle)}
+    view = specimen(options["rows"])
+    speckle = Speckle(SpeckleSpec(), view.grid.shape)
+    contestants: dict[str, Work] = {OURS: lambda: exact(view, speckle)}
     for name, factor, sample, storage in TEXTURES:
         texture = as_stored(sampled(speckle, factor), storage)
-        contestants[name] = riley_side.textured(scene, texture, sample, options["threads"])
+        contestants[name] = riley_side.textured(view, texture, sample, options["threads"])
     laps = in_turn(contestants, options["laps"])
-    pixels, truth = some_truth(scene, speckle)
+    pixels, truth = some_truth(view, speckle)
     images = {
         name: lap.result if name == OURS else lap.result[0] * in_grey_levels(name)
         for name, lap in laps.items()
     }
     errors = {name: image[pixels] - truth for name, image in images.items()}
     return {
-        "shape": scene.grid.shape,
+        "shape": view.grid.shape,
         "material_px": int((images[OURS] > 0).sum()),
         "threads": options["threads"],
         "points": POINTS,
@@ -70,10 +70,10 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def exact(scene: Scene, speckle: Speckle) -> FloatArray:
+def exact(view: MeshView, speckle: Speckle) -> FloatArray:
     """Our image: the inverse mapping, and the pattern itself at the mapped points [grey levels]."""
-    mesh, grid = scene.mesh, scene.grid
-    state = ImagedState(mesh, scene.deformed - mesh.nodes, grid, speckle, 0.0)
+    mesh, grid = view.mesh, view.grid
+    state = ImagedState(mesh, view.deformed - mesh.nodes, grid, speckle, 0.0)
     grey = state.average(np.zeros((1, 2)), np.ones(1), np.ones(grid.shape, np.bool_))
     shown = grey.reshape(grid.shape).astype(np.float32)
     return np.asarray(GREY_LEVELS * shown, dtype=np.float64)
@@ -102,10 +102,10 @@ def in_grey_levels(name: str) -> float:
     return 1.0 if storage[name] == "8-bit" else GREY_LEVELS
 
 
-def some_truth(scene: Scene, speckle: Speckle) -> tuple[tuple[Any, ...], FloatArray]:
+def some_truth(view: MeshView, speckle: Speckle) -> tuple[tuple[Any, ...], FloatArray]:
     """(rows, cols) of some pixels of the material, and their grey levels, term by term."""
-    mesh, grid = scene.mesh, scene.grid
-    located = locate(scene.deformed, mesh.cells, mesh.element, grid)
+    mesh, grid = view.mesh, view.grid
+    located = locate(view.deformed, mesh.cells, mesh.element, grid)
     inside = np.argwhere(located.mask)
     row, col = np.random.default_rng(0).choice(inside, POINTS, replace=False).T
     x, y = interpolate(located, mesh.cells, mesh.element, mesh.nodes)[:, row, col]

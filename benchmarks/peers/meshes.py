@@ -20,7 +20,7 @@ _QUAD = ((0, 0), (2, 0), (2, 2), (0, 2), (1, 0), (2, 1), (1, 2), (0, 1), (1, 1))
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class MeshView:
     """A mesh in two states, and the pixels that show the second.
 
     Parameters
@@ -41,7 +41,7 @@ class Scene:
     grid: PixelGrid
 
 
-def specimen(rows: int) -> Scene:
+def specimen(rows: int) -> MeshView:
     """Show the shipped solution after buckling in the paper's format, 2751 x 2207 px, upright."""
     path = shipped_solution("paper-virtual")
     assert path is not None, "the case ships its solution"
@@ -49,10 +49,10 @@ def specimen(rows: int) -> Scene:
     cols = round(rows * 2207 / 2751)
     grid = PixelGrid.centred(rows, cols, 21.8 / rows)
     deformed = solution.mesh.nodes + solution.at(STRAIN).displacement
-    return Scene("paper's specimen", solution.mesh, deformed, grid)
+    return MeshView("paper's specimen", solution.mesh, deformed, grid)
 
 
-def bulged(element: str, rows: int, count: int = 20, seed: int = 0) -> Scene:
+def bulged(element: str, rows: int, count: int = 20, seed: int = 0) -> MeshView:
     """Fill an image with ``count`` x ``count`` quadrilaterals, skewed and with bulged edges.
 
     Corners are moved by up to 0.16 of an edge each way, nodes on edges and in the middle by up
@@ -71,10 +71,10 @@ def bulged(element: str, rows: int, count: int = 20, seed: int = 0) -> Scene:
     bulge[even, even] = 0.0
     deformed += bulge
     grid = PixelGrid.centred(rows, rows, 2.2 * count / rows)
-    return _scene("bulged, skewed", element, lattice, deformed, grid)
+    return _view("bulged, skewed", element, lattice, deformed, grid)
 
 
-def aligned(element: str, rows: int) -> Scene:
+def aligned(element: str, rows: int) -> MeshView:
     """Fill an image with squares, or halves of them, whose edges run through pixel centres.
 
     All positions are whole eighths, so that nothing is rounded: every pixel on an edge is on it
@@ -83,17 +83,17 @@ def aligned(element: str, rows: int) -> Scene:
     count = (rows - 40) // 16
     lattice = _lattice(count)
     grid = PixelGrid.centred(rows | 1, rows | 1, 0.125)
-    return _scene("edges through pixel centres", element, lattice, lattice, grid)
+    return _view("edges through pixel centres", element, lattice, lattice, grid)
 
 
-def _scene(
+def _view(
     name: str, element: str, lattice: FloatArray, deformed: FloatArray, grid: PixelGrid
-) -> Scene:
+) -> MeshView:
     """Pick the nodes that this element has."""
     cells = _cells(element, len(lattice) // 2)
     used, cells = np.unique(cells, return_inverse=True)
     mesh = Mesh(lattice.reshape(-1, 2)[used], cells.reshape(-1, _nodes(element)), element)
-    return Scene(name, mesh, deformed.reshape(-1, 2)[used], grid)
+    return MeshView(name, mesh, deformed.reshape(-1, 2)[used], grid)
 
 
 def _lattice(count: int) -> FloatArray:

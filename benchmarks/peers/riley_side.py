@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import riley
-from meshes import Scene
+from meshes import MeshView
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
@@ -17,31 +17,31 @@ BACKGROUND = -1e6
 _MESH_TYPE = {"T3": "tri3", "T6": "tri6", "Q4": "quad4", "Q8": "quad8", "Q9": "quad9"}
 
 
-def nodal(scene: Scene, field: FloatArray, threads: int) -> Render:
+def nodal(view: MeshView, field: FloatArray, threads: int) -> Render:
     """Make a renderer of a nodal field (n, 1) or (n, 3), which gives (fields, rows, cols)."""
     shader = riley.NodalShader(field=field[:, None, :], scaling_type=riley.ScaleStrategy.none)
-    return _renderer(scene, shader, threads)
+    return _renderer(view, shader, threads)
 
 
-def textured(scene: Scene, texture: NDArray[np.generic], sample: str, threads: int) -> Render:
+def textured(view: MeshView, texture: NDArray[np.generic], sample: str, threads: int) -> Render:
     """Make a renderer of a texture that covers the grid from its first to its last pixel centre.
 
     ``sample`` is one of riley's names of a TextureSample.
     """
-    row, col = scene.grid.to_px(*scene.mesh.nodes.T)
-    uvs = np.column_stack([col / (scene.grid.cols - 1), row / (scene.grid.rows - 1)])
+    row, col = view.grid.to_px(*view.mesh.nodes.T)
+    uvs = np.column_stack([col / (view.grid.cols - 1), row / (view.grid.rows - 1)])
     how = riley.TextureSample[sample]
-    return _renderer(scene, riley.TextureShader(uvs, texture[None], sample=how), threads)
+    return _renderer(view, riley.TextureShader(uvs, texture[None], sample=how), threads)
 
 
-def _renderer(scene: Scene, shader: riley.Shader, threads: int) -> Render:
-    name = _MESH_TYPE[scene.mesh.element]
+def _renderer(view: MeshView, shader: riley.Shader, threads: int) -> Render:
+    name = _MESH_TYPE[view.mesh.element]
     convention = riley.ConnectConvention(
         riley.EElemType(name), riley.EConnectAxis.ROW, 0, riley.ENodeOrder.VTK
     )
-    coords = np.column_stack([scene.deformed, np.zeros(len(scene.deformed))])
-    mesh = riley.create_mesh(convention, riley.MeshType[name], coords, scene.mesh.cells, shader)
-    camera = _camera(scene)
+    coords = np.column_stack([view.deformed, np.zeros(len(view.deformed))])
+    mesh = riley.create_mesh(convention, riley.MeshType[name], coords, view.mesh.cells, shader)
+    camera = _camera(view)
     config = riley.RasterConfig(
         parallel=threads,
         save_strategy=riley.SaveStrategy.memory,
@@ -57,9 +57,9 @@ def _renderer(scene: Scene, shader: riley.Shader, threads: int) -> Render:
     return render
 
 
-def _camera(scene: Scene) -> riley.Camera:
+def _camera(view: MeshView) -> riley.Camera:
     """A pinhole straight above the plane sees it as it is, scaled: a pixel is a pixel of ours."""
-    grid = scene.grid
+    grid = view.grid
     x = grid.x0 + 0.5 * (grid.cols - 1) * grid.pixel_size
     y = grid.y0 - 0.5 * (grid.rows - 1) * grid.pixel_size
     return riley.Camera(

@@ -57,13 +57,13 @@ class ResolutionSpec:
 
     def write(self, folder: Path) -> str:
         """Leave it for workers; returns its name."""
-        return leave(to_plain(self), folder, "subjects/{}.json")
+        return leave(to_plain(self), folder, "pairs/{}.json")
 
     @classmethod
     @lru_cache(maxsize=1)
     def read(cls, folder: Path, name: str) -> ResolutionSpec:
         """What :meth:`write` left; one worker keeps it, and its images, between cases."""
-        return made(ResolutionSpec, read_json(folder / "subjects" / f"{name}.json"))
+        return made(ResolutionSpec, read_json(folder / "pairs" / f"{name}.json"))
 
     @property
     def points(self) -> FloatArray:

@@ -3,7 +3,7 @@
 A pair is described once, made once, and opened by workers. In a study's folder::
 
     solution.h5            the exact displacements
-    subjects/NAME.json     a pair, how it is imaged and how it is correlated; NAME is its digest
+    pairs/NAME.json        a pair, how it is imaged and how it is correlated; NAME is its digest
     images/KEY/            the images, under the digest of all that they depend on
 """
 
@@ -103,7 +103,7 @@ class ImagePairSpec:
             "specimen": self.experiment.specimen,
             "setting": setting,
         }
-        return leave(to_plain(description), folder, "subjects/{}.json")
+        return leave(to_plain(description), folder, "pairs/{}.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +218,7 @@ def noisy(pair: ImagePair, level: float, rng: np.random.Generator, sign: float =
 
 
 def _description(folder: Path, name: str) -> dict[str, Any]:
-    return dict(read_json(folder / "subjects" / f"{name}.json"))
+    return dict(read_json(folder / "pairs" / f"{name}.json"))
 
 
 @lru_cache(maxsize=1)

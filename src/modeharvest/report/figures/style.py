@@ -124,7 +124,7 @@ def draw_path(axes: Axes, path: Path, **looks: Any) -> PathPatch:
     """Draw a path into axes whose limits are set by other means; returns its patch.
 
     Unlike ``Axes.add_patch`` it does not seek the extent of every curved piece: on a specimen's
-    outline that takes longer than drawing it.
+    boundary that takes longer than drawing it.
     """
     patch = PathPatch(path, **looks)
     axes.add_artist(patch)
