@@ -60,12 +60,9 @@ class NormalEquations:
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
         return NormalEquations(
-            self.matrix + other.matrix,
-            self.gradient + other.gradient,
-            self.cost + other.cost,
-            self.pixels + other.pixels,
-            self.outside_image + other.outside_image,
-        )
+            self.matrix + other.matrix, self.gradient + other.gradient, self.cost + other.cost,
+            self.pixels + other.pixels, self.outside_image + other.outside_image,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -222,13 +222,9 @@ class _TrialStep:
 
 
 def _descend(
-    at: _SearchPoint,
-    evaluate: Evaluate,
-    step_length: StepLength,
-    options: GaussNewtonOptions,
-    short_px: float,
-    eigenvalue_cutoff: float,
-) -> _TrialStep:
+    at: _SearchPoint, evaluate: Evaluate, step_length: StepLength, options: GaussNewtonOptions,
+    short_px: float, eigenvalue_cutoff: float,
+) -> _TrialStep:  # fmt: skip
     """Take a step that lowers the cost, damped as much as it takes."""
     eigen, damping = ScaledEigen.of(at.curvature), at.damping
     while True:

@@ -191,18 +191,10 @@ def tables_of(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> Tables:
     trig_x = np.stack([np.sin(tx), np.cos(tx)], axis=1).reshape(-1, grid.cols)
     first = 2 + n + 3 * len(waves)
     return Tables(
-        eta,
-        np.vstack([xi, trig_x, taper_x]),
-        v0,
-        v,
-        ansatz.brightness.squares(a[ansatz.phi_offset(n) :]),
-        *ansatz.brightness.fields(first),
-        waves,
-        np.array(mode_of_wave, dtype=np.int64),
-        np.sin(ty),
-        np.cos(ty),
-        taper_y,
-    )
+        eta, np.vstack([xi, trig_x, taper_x]), v0, v,
+        ansatz.brightness.squares(a[ansatz.phi_offset(n) :]), *ansatz.brightness.fields(first),
+        waves, np.array(mode_of_wave, dtype=np.int64), np.sin(ty), np.cos(ty), taper_y,
+    )  # fmt: skip
 
 
 @compiled(relaxed=True)

@@ -103,14 +103,9 @@ def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiab
     px = result.grid.pixel_size
     amplitudes = tuple(float(np.sqrt((u[i] ** 2).mean()) / px) for i in range(n_modes))
     return Identifiability(
-        result.condition_number,
-        result.undetermined,
-        _worst(result),
-        tuple(overlaps),
-        result.model_error_px,
-        amplitudes,
-        result.weighting.speckle_size_px,
-    )
+        result.condition_number, result.undetermined, _worst(result), tuple(overlaps),
+        result.model_error_px, amplitudes, result.weighting.speckle_size_px,
+    )  # fmt: skip
 
 
 def _sensitivities(result: Result, mask: ArrayLike | None) -> tuple[FloatArray, list[FloatArray]]:

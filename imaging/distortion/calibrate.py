@@ -93,14 +93,10 @@ class LensEstimate:
         one, many = noise
         k = len(fit.coefficients)
         return cls(
-            distortion=model.distortion(fit.coefficients),
-            coefficients=fit.coefficients,
-            covariance=fit.inverse[:k, :k] * (fit.variance * many / one),
-            model=model,
-            noise_sd=float(np.sqrt(fit.variance / one)),
-            matches=fit.matches,
-            bic=fit.bic,
-        )
+            distortion=model.distortion(fit.coefficients), coefficients=fit.coefficients,
+            covariance=fit.inverse[:k, :k] * (fit.variance * many / one), model=model,
+            noise_sd=float(np.sqrt(fit.variance / one)), matches=fit.matches, bic=fit.bic,
+        )  # fmt: skip
 
     def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Standard deviation of S [px] at ideal positions [px], by the images' noise alone."""
@@ -213,13 +209,9 @@ def _coarse_fit(
 
 
 def _trials(
-    photographs: Sequence[FloatImage],
-    model: PolynomialModel,
-    fit: Fit,
-    moving: tuple[bool, bool, bool],
-    options: CalibrationOptions,
-    report: Callable[[], None],
-) -> tuple[list[tuple[PolynomialModel, Fit]], float]:
+    photographs: Sequence[FloatImage], model: PolynomialModel, fit: Fit,
+    moving: tuple[bool, bool, bool], options: CalibrationOptions, report: Callable[[], None],
+) -> tuple[list[tuple[PolynomialModel, Fit]], float]:  # fmt: skip
     """One fit a degree, the best one to the end; and the stride of the points [px]."""
     free = (*moving, True, True)
     views = _views(photographs, fit.poses, free, _BLUR_PX)
@@ -327,13 +319,9 @@ def calibration_of(
     own, covariance = np.zeros(fit.free.shape), fit.inverse * (fit.variance * many / one)
     own[fit.free] = np.sqrt(np.diag(covariance)[len(fit.coefficients) :])
     return Calibration(
-        **vars(LensEstimate.of(model, fit, noise)),
-        shifts=fit.poses[:, :2],
-        shifts_sd=own[:, :2],
-        angles=fit.poses[:, 2],
-        angles_sd=own[:, 2],
-        trials=_tried(trials, noise),
-    )
+        **vars(LensEstimate.of(model, fit, noise)), shifts=fit.poses[:, :2], shifts_sd=own[:, :2],
+        angles=fit.poses[:, 2], angles_sd=own[:, 2], trials=_tried(trials, noise),
+    )  # fmt: skip
 
 
 def _tried(

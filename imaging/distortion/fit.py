@@ -206,13 +206,9 @@ class Fit:
 
 
 def fit_views(
-    model: PolynomialModel,
-    c: FloatArray,
-    views: Sequence[View],
-    points: tuple[FloatArray, FloatArray],
-    tolerance_px: float = 1e-5,
-    max_iterations: int = 30,
-) -> Fit:
+    model: PolynomialModel, c: FloatArray, views: Sequence[View],
+    points: tuple[FloatArray, FloatArray], tolerance_px: float = 1e-5, max_iterations: int = 30,
+) -> Fit:  # fmt: skip
     """Find the model's coefficients and the views' poses by Gauss-Newton.
 
     model, c, views : the distortions to choose from; (k,) coefficients and poses to begin with.
@@ -234,15 +230,10 @@ def fit_views(
         if length < tolerance_px:
             break
     return Fit(
-        coefficients=c,
-        poses=np.array([view.pose for view in views]),
-        inverse=eigen.inverse(),
-        free=free,
-        sum_of_squares=squares,
-        freedom=max(1, freedom - len(step)),
-        converged=bool(length < tolerance_px),
-        matches=matches,
-    )
+        coefficients=c, poses=np.array([view.pose for view in views]), inverse=eigen.inverse(),
+        free=free, sum_of_squares=squares, freedom=max(1, freedom - len(step)),
+        converged=bool(length < tolerance_px), matches=matches,
+    )  # fmt: skip
 
 
 def _assemble(
