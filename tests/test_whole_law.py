@@ -120,8 +120,8 @@ def test_what_is_in_both_solutions_does_not_contradict() -> None:
     n, random = len(mesh.nodes), np.random.default_rng(0)
     samples = random.standard_normal((n, 2, 16))
     none = np.zeros((n, 2))
-    free = Deviations(samples, samples[..., :0], none + 0.1, np.zeros((n, 4, 4)))
-    lawful = Deviations(samples.copy(), samples[..., :0], none, np.zeros((n, 4, 4)))
+    free = Deviations(samples, samples[..., :0], samples[..., :0], none + 0.1, np.zeros((n, 4, 4)))
+    lawful = free._replace(samples=samples.copy(), bias=none)
     nodes = np.arange(n)
     assert contradicted(none + 0.29, free, lawful, nodes) == 0.0
     assert contradicted(none + 0.31, free, lawful, nodes) == 1.0
@@ -134,12 +134,15 @@ def test_bias_by_a_linear_change() -> None:
     mesh = holed_cell(OBLIQUE, 4)
     n = len(mesh.nodes)
     noise, bias = np.full((n, 2, 4), 0.1), np.full((n, 2), 3.0)
-    bare = Deviations(noise, noise[..., :0], bias, np.zeros((n, 4, 4)))
+    bare = Deviations(noise, noise[..., :0], noise[..., :0], bias, np.zeros((n, 4, 4)))
     slope = np.array([[0.1, 0.2], [0.0, -0.3]])
     found = bare.with_bias(mesh, 0.0 * mesh.nodes + [4.0, 0.0])
     np.testing.assert_allclose(found.bias, np.broadcast_to([5.0, 3.0], (n, 2)), rtol=1e-12)
     own = (found.roots**2).sum(axis=2)  # elements' own error isn't carried to other nodes
     np.testing.assert_allclose(own, np.broadcast_to([16.01, 0.01], (n, 2)), rtol=1e-12)
+    lost = np.random.default_rng(0).standard_normal((n, 2, 4))  # by what smoothing takes away it is
+    own = (found._replace(lost=lost).roots ** 2).sum(axis=2)
+    np.testing.assert_allclose(own, np.broadcast_to([41.01, 9.01], (n, 2)), rtol=1e-12)
     found = bare.with_bias(mesh, mesh.nodes @ slope.T)
     expected = np.outer(slope.ravel(), slope.ravel())
     np.testing.assert_allclose(found.gradient, np.broadcast_to(expected, (n, 4, 4)), atol=1e-9)

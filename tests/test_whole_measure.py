@@ -11,12 +11,14 @@ from plate_with_hole import GRID, HALF_SIZE, plate_pair, quadratic_field
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.fields import field_of
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
 from modeharvest.idic.finite_element.result import NodalResult, refitted
+from modeharvest.idic.modes import square_family
+from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
@@ -116,6 +118,17 @@ def test_intervals_of_strains(noisy: tuple[ImagePair, NodalResult]) -> None:
     error, sd = result.field("green_lagrange") - true, result.field_deviation("green_lagrange")
     # One seed; docs/whole_field.md has 30 of a specimen with holes.
     assert 0.9 < np.mean(abs(error) < 1.96 * sd) < 0.995
+
+
+def test_edges_count_by_what_another_row_of_pixels_changes(
+    noisy: tuple[ImagePair, NodalResult],
+) -> None:
+    pair, result = noisy
+    assert result.roots is not None
+    one = FiniteElementOptions(cutoff_px=result.cutoff_px, edge_px=1)
+    without = measure_displacement(pair, at_rest, result.mesh, options=one)
+    change = without.displacement - result.displacement
+    assert np.linalg.norm(result.roots[..., -1] - change) < 0.2 * np.linalg.norm(change)
 
 
 def test_found_cutoff_is_nearly_the_best(noisy: tuple[ImagePair, NodalResult]) -> None:
@@ -224,6 +237,30 @@ def test_error_bars_by_noise_in_either_image(noise: tuple[float, float]) -> None
     assert 0.88 < np.mean(ratios) / 0.4654 < 1.15
     # Of 4 times 12 unknowns: 1 with a scatter of 21 %.
     assert 0.5 < np.mean(np.square(refits)) < 1.6
+
+
+def test_a_refit_moves_as_its_covariance_says() -> None:
+    """Beside a w, because of which Gauss and Newton's matrix is off by 14 %."""
+    body = FiniteElementOptions(16.0, 12.0).body(plate_pair(quadratic_field).masks[0], GRID)
+    box, mesh = Box.centred(*HALF_SIZE), body.mesh
+    ansatz = Ansatz.on(box, [(square_family(), box)], 0.4, AnsatzOptions(1, 1))
+    a, (x, y) = ansatz.initial_guess(0.0, 0.03), mesh.nodes.T
+    w = 0.004 * np.stack([np.sin(9.0 * x + 1.0) * x, np.cos(8.0 * y)], axis=1)
+    change = 1e-4 * np.stack([np.cos(3.0 * x - 4.0 * y), np.sin(5.0 * x)], axis=1)
+    none, mask = np.zeros((len(x), 4, 4)), np.ones(GRID.shape, dtype=np.bool_)
+
+    def fitted(u: np.ndarray, roots: np.ndarray | None = None) -> Result:
+        measured = NodalResult(
+            mesh, u, 0.0 * u, 0.0 * u, 0.0 * u, none, GRID, 20.0, (), 0.0, 0.0, 1, 0, 1.0, "",
+            roots=roots,
+        )  # fmt: skip
+        return refitted(measured, ansatz, a, mask)
+
+    here = fitted(ansatz.displacement_at(a, mesh.nodes) + w, change[..., None])
+    there = fitted(ansatz.displacement_at(a, mesh.nodes) + w + change)
+    moved, scale = abs(there.unknowns - here.unknowns), np.sqrt(np.diag(there.inverse))
+    off = np.linalg.norm((here.standard_errors() - moved) / scale)
+    assert off < 0.08 * np.linalg.norm(moved / scale)
 
 
 @pytest.mark.parametrize(("wavelength_px", "left", "within"), [(200, 1.0, 0.05), (45, 0.0, 0.2)])

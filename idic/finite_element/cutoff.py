@@ -111,6 +111,8 @@ class Deviations(NamedTuple):
 
     samples: FloatArray
     """(n, 2, s) what random noise makes of u [mm]."""
+    lost: FloatArray
+    """(n, 2, s) random displacements, of any size, like those that smoothing takes away [mm]."""
     changes: FloatArray
     """(n, 2, k) what smoothing, or no law, may change u by [mm]."""
     bias: FloatArray
@@ -126,7 +128,9 @@ class Deviations(NamedTuple):
     @property
     def roots(self) -> FloatArray:
         """(n, 2, s + k) vectors whose outer products sum up to the covariance of all nodes [mm]."""
-        return np.concatenate([self.samples / np.sqrt(self.samples.shape[2]), self.changes], axis=2)
+        by_noise = self.samples / np.sqrt(self.samples.shape[2])
+        scale = self.bias / np.sqrt(np.maximum((self.lost**2).sum(axis=2), _TINY))
+        return np.concatenate([by_noise, scale[..., None] * self.lost, self.changes], axis=2)
 
     def with_bias(self, mesh: Mesh, change: FloatArray, of_slopes: float = 1.0) -> Deviations:
         """Count a possible change (n, 2) of u [mm], rms around nodes; its slope so many times."""
@@ -134,6 +138,7 @@ class Deviations(NamedTuple):
         spread = smoothed(mesh, np.einsum("nij,nkl->nijkl", slope, slope))
         return Deviations(
             self.samples,
+            self.lost,
             np.concatenate([self.changes, change[..., None]], axis=2),
             np.sqrt(self.bias**2 + smoothed(mesh, change**2)),
             self.gradient + spread.reshape(-1, 4, 4),
@@ -159,20 +164,20 @@ def deviations(
     scale = (at.sums.excess * in_gradient)[:, None, None, None]
     random = at.body.samples(at.sums.blocks * scale)
     found = noise * factor.solve(random).reshape(-1, 2, SAMPLES)
-    if isinstance(at.prior, Smoothness):  # what a law allows there is not known
+    lost = none = found[..., :0]
+    if isinstance(at.prior, Smoothness):  # what a law allows is not known
+        lost = factor.solve(at.body.smoothness_samples).reshape(-1, 2, SAMPLES)
         blank = mean_around(mesh, np.repeat(1.0 - at.signal, 6).reshape(-1, 6))
         # The roughness that was found is that of so many unknowns, or the weight is too large.
         grown = float((at.u - at.prior.start) @ at.penalty)
         rough = weight * grown / max(noise**2 * unknowns, _TINY)
         wide = noise * np.sqrt(weight * blank * max(at.mean(in_gradient), rough))
-        found += wide[:, None, None] * factor.solve(at.body.smoothness_samples).reshape(
-            -1, 2, SAMPLES
-        )
+        found += wide[:, None, None] * lost
     change = (at.step(cutoff, _STRONGER) - here).reshape(-1, 2)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
     error = interpolation_error(mesh, at.u.reshape(-1, 2))
-    return Deviations(found, found[..., :0], error, spread).with_bias(mesh, change, _OF_SLOPES)
+    return Deviations(found, lost, none, error, spread).with_bias(mesh, change, _OF_SLOPES)
 
 
 def contradicted(

@@ -40,7 +40,7 @@ from modeharvest.idic.finite_element.system import Body, Imbalance, Linearised, 
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
-from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
+from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, eroded, smoothed
 from modeharvest.idic.solver.weighting import best_blur
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
@@ -366,6 +366,23 @@ class _Measurement:
         f, g = self.noise if any(self.noise) else (1.0, 1.0)
         return np.asarray((f * at.signal + g / det) / (f + g * value))
 
+    def _without_edges(self, at: Linearised) -> FloatArray:
+        """(n, 2, 1) change of u [mm] with twice as many rows of pixels left out at edges, or one.
+
+        By such changes show what images are wrong by there, and elements beyond their pixels.
+        """
+        on, body = self._prepare(FULL), self.body
+        weight = at.weight(self.cutoff_px * self.pair.grid.pixel_size)
+        inner = eroded(on.images.mask, max(1, self.options.edge_px))
+        keep = inner[on.pixels.row, on.pixels.col]
+        start = np.concatenate([[0], np.cumsum(keep)])[on.pixels.start]
+        pixels = ElementPixels(start, *(part[..., keep] for part in on.pixels[1:]))
+        left = normal_equations(pixels, body.mesh, on.images, at.u.reshape(-1, 2), on.continued)
+        share = at.gain * at.signal[:, None, None]
+        M = body.matrix(share[..., None] ** 2 * left.blocks)
+        rest = body.vector(share * left.gradient) - weight * at.penalty
+        return body.factor(M, at.R, weight).solve(rest).reshape(-1, 2, 1)
+
     def result(self) -> NodalResult:
         """Make the result, with its standard deviations."""
         at, here, sd = self._assessed()
@@ -389,7 +406,7 @@ class _Measurement:
             standard_deviation=np.hypot(sd.by_noise, sd.bias),
             noise_deviation=sd.by_noise,
             gradient_covariance=sd.gradient,
-            roots=sd.roots,
+            roots=np.concatenate([sd.roots, self._without_edges(at)], axis=2),
             grid=self.pair.grid,
             residual_rms=at.sums.rms,
             residual_noise=here.noise,

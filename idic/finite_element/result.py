@@ -17,8 +17,9 @@ from modeharvest.idic.correlate import ASTRAY, correlate, fit_displacement, refi
 from modeharvest.idic.finite_element.cutoff import Risk
 from modeharvest.idic.finite_element.fields import deviation_of, field_of, nodal_gradient
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.result import Result, determined_part
+from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.assembly import Assembly
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
 from modeharvest.imaging.pair import ImagePair
@@ -30,6 +31,8 @@ from modeharvest.util.progress import Progress, silent
 _BEYOND_PX = 2.0
 """How far beyond the mesh's edge its fields are continued: the edge is known to half a pixel."""
 _CHUNK = 500_000
+_STEP = 1e-5
+"""Of a mode's parameters, for derivatives: these are of waves a few dozen radians long."""
 WHOLE = "the whole displacement"
 Where = PixelGrid | FloatArray | None
 """Pixels, points (k, 2) [mm], or the nodes."""
@@ -183,23 +186,37 @@ class WholeField:
 def refitted(measured: NodalResult, ansatz: Ansatz, guess: FloatArray, mask: BoolArray) -> Result:
     """An ansatz, fitted to what was measured on the pixels of a mask; ``guess``: (n,) unknowns.
 
-    Its covariance is that of what was measured, by noise and smoothing, unless it is from a file.
+    Its covariance is that of what was measured, by noise, smoothing and edges, unless that is from
+    a file.
     """
     u, roots, mesh = measured.displacement_on(), measured.roots, measured.mesh
-    fit = fit_displacement(u, measured.grid, ansatz, guess, mask & np.isfinite(u[..., 0]))
+    inside = mask & np.isfinite(u[..., 0])
+    fit = fit_displacement(u, measured.grid, ansatz, guess, inside)
     if roots is None:
         return fit
     # Three points of an element, the middles of its sides, integrate quadratics exactly.
     x, middle = mesh.nodes[mesh.cells], mesh.cells[:, 3:]
     area = np.linalg.det(x[:, 1:3] - x[:, :1]) / 6.0 / measured.grid.pixel_size**2
     weight = np.bincount(middle.ravel(), np.repeat(area, 3), len(mesh.nodes))
-    at = np.flatnonzero(weight)
+    at, inverse = np.flatnonzero(weight), fit.inverse.copy()
     J = fit.ansatz.sensitivities(fit.unknowns, *mesh.nodes[at].T[:, :, None])[:, 0]
-    known, lost = determined_part(fit.inverse)
-    moved = known @ np.einsum("kcn,k,kcs->ns", J, weight[at], roots[at], optimize=True)
-    inverse = moved @ moved.T / max(2.0 * fit.noise_sd**2, 1e-300)  # of which it is a factor
-    inverse[lost, lost] = np.inf
+    slopes = np.einsum("kcn,k,kcs->ns", J, weight[at], roots[at], optimize=True)
+    known = np.flatnonzero(np.isfinite(np.diag(inverse)))
+    own = np.ix_(known, known)
+    moved = np.linalg.solve(_hessian(fit, u, inside)[own], slopes[known])
+    inverse[own] = moved @ moved.T / max(2.0 * fit.noise_sd**2, 1e-300)  # of which it is a factor
     return replace(fit, inverse=inverse)
+
+
+def _hessian(fit: Result, u: FloatArray, inside: BoolArray) -> FloatArray:
+    """(n, n) of a fit's cost: beside w, which is left of u, not Gauss and Newton's matrix."""
+    fits, a = Assembly(fit.ansatz, fit.grid, inside), fit.unknowns
+    here = fits.displacement(a, u)
+    H = here.matrix
+    for k in range(fit.ansatz.phi_offset(0), a.size):  # u is linear in the other unknowns
+        there = fits.displacement(a + _STEP * np.eye(a.size)[k], u, with_matrix=False)
+        H[k] = H[:, k] = (there.gradient - here.gradient) / _STEP
+    return H
 
 
 def refitted_correlation(
