@@ -17,8 +17,10 @@ from hypothesis import strategies as st
 from synthetic_lattice import row
 
 from modeharvest.fem.lattice.options import simple_shear
-from modeharvest.fem.materials import Ogden
+from modeharvest.fem.materials import MATERIALS, Ogden, TwoTermI1
+from modeharvest.runs.lattice.loads import Loading
 from modeharvest.util.errors import InputError
+from modeharvest.util.typed import made
 from modeharvest.validation.studies import lattice as mode_study
 from modeharvest.validation.studies.lattice import (
     LOADINGS,
@@ -124,6 +126,12 @@ def test_an_ogden_material_has_the_constants_asked_for(nu: float, shear: float) 
     mu = 0.5 * sum(material.moduli)
     assert mu == pytest.approx(shear)
     assert material.kappa / (2.0 * (material.kappa + mu)) == pytest.approx(nu, abs=1e-6)
+
+
+def test_a_study_calls_materials_and_loadings_as_cases_do() -> None:
+    assert MATERIALS[name_of(TwoTermI1(), STUDIED_MATERIALS)] is TwoTermI1
+    for name, loading in LOADINGS.items():
+        assert made(Loading, {"kind": name}).macro() == loading
 
 
 def test_materials_and_loadings_are_known_by_name_or_by_their_values() -> None:

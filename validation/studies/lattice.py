@@ -111,7 +111,7 @@ EQ_MODE = square_family("hole")
 _STEP, _CLOSE = 0.02, 0.002  # of the load [-]
 _NARROW = 0.005  # bracket of d/l where another mode comes first [-]
 LOADINGS: dict[str, MacroLoading] = {
-    "uniaxial": uniaxial(), "uniaxial strain": uniaxial_strain(), "equibiaxial": equibiaxial()
+    "uniaxial": uniaxial(), "uniaxial-strain": uniaxial_strain(), "equibiaxial": equibiaxial()
 }  # fmt: skip
 
 
@@ -122,7 +122,7 @@ def ogden(exponent: float, poisson: float, shear: float = 0.6) -> Ogden:
 
 
 STUDIED_MATERIALS: dict[str, Material] = {
-    "two-term I1": TwoTermI1(),
+    "two-term-I1": TwoTermI1(),
     **{f"Ogden m={m:g}, nu={nu:.2f}": ogden(m, nu)
        for m, nu in ((3, 0.45), (2, 0.45), (4, 0.45), (6, 0.45), (-2, 0.45), (3, 0.40), (3, 0.49))},
 }  # fmt: skip
@@ -136,7 +136,7 @@ class StudiedLattice:
     ratio: float = 0.7895
     """Hole diameter over cell size d/l [-]."""
     loading: MacroLoading = LOADINGS["uniaxial"]
-    material: Material = STUDIED_MATERIALS["two-term I1"]
+    material: Material = STUDIED_MATERIALS["two-term-I1"]
     pitch: float = 1.9
     """Unit cell size l [mm]."""
     divisions: int = 13
@@ -364,9 +364,6 @@ def first_mode_limit(
     return FirstModeLimit(loading, low.ratio, high.ratio, low.kind)
 
 
-_LOADINGS = tuple(name.replace(" ", "-") for name in LOADINGS)
-
-
 @dataclass(frozen=True)
 class StudyPlan:
     """What a study asks about one lattice.
@@ -377,7 +374,7 @@ class StudyPlan:
 
     ratios: tuple[float, ...] = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
     """d/l [-]: 0.7895 is the paper's; 0.8696 and 0.95 have independent values, too."""
-    loadings: tuple[str, ...] = _LOADINGS
+    loadings: tuple[str, ...] = tuple(LOADINGS)
     """Among "uniaxial", "uniaxial-strain" and "equibiaxial"."""
     pitches: tuple[float, ...] = ()
     """Other l [mm]; the mesh is scaled, too."""
@@ -391,7 +388,7 @@ class StudyPlan:
     """Load up to which to look for critical points [-]."""
 
     def __post_init__(self) -> None:
-        for names, known in ((self.loadings, _LOADINGS), (self.materials, STUDIED_MATERIALS)):
+        for names, known in ((self.loadings, LOADINGS), (self.materials, STUDIED_MATERIALS)):
             for name in names:
                 if name not in known:
                     raise InputError(f"unknown name {name!r}{nearest(name, list(known))}")
@@ -416,11 +413,10 @@ def run_lattice_study(
     """
     kept = ModeTable(table)
     base = replace(base, divisions=plan.divisions, largest=plan.largest)
-    loadings = [name.replace("-", " ") for name in plan.loadings]
     lattices = [replace(base, ratio=r, loading=LOADINGS[name])
-                for name, r in product(loadings, plan.ratios)]  # fmt: skip
+                for name, r in product(plan.loadings, plan.ratios)]  # fmt: skip
     rows = kept.rows(lattices, pattern_row, progress)
-    limits = [first_mode_limit(base, name, rows, kept) for name in loadings]
+    limits = [first_mode_limit(base, name, rows, kept) for name in plan.loadings]
     scaled = [replace(base, pitch=pitch) for pitch in plan.pitches]
     others = [replace(base, material=STUDIED_MATERIALS[name]) for name in plan.materials]
     overlaid = [replace(base, ratio=ratio) for ratio in plan.overlays]

@@ -239,7 +239,7 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
     """Other d/l [-]."""
     pitches: tuple[float, ...] = (0.95,)
     """Other l [mm], with which specimen, elements and pixels are scaled."""
-    materials: tuple[str, ...] = ("two-term I1", "Ogden m=3, nu=0.40", "Ogden m=3, nu=0.49")
+    materials: tuple[str, ...] = ("two-term-I1", "Ogden m=3, nu=0.40", "Ogden m=3, nu=0.49")
     """Names among ``STUDIED_MATERIALS``."""
     gradings_x: tuple[float, ...] = (0.02,)
     gradings_y: tuple[float, ...] = (0.02,)
