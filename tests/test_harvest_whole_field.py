@@ -158,9 +158,7 @@ def test_against_the_truth(harvested: Path) -> None:
         true, PHOTOGRAPHED.grid, refit.ansatz, refit.unknowns, PHOTOGRAPHED.mask
     )
     specimen = Specimen(holes_x=4, holes_y=4, diameter=1.4, pitch=PITCH)
-    errors = compare_whole(
-        WholeField(measured, refit, 1.0), true, best, PHOTOGRAPHED.mask, specimen
-    )
+    errors = compare_whole(WholeField(measured, refit), true, best, PHOTOGRAPHED.mask, specimen)
     error = true - measured.displacement_on()
     assert errors.rms_px == pytest.approx(rms_px(error, np.isfinite(error[..., 0])))
     assert errors.rms_edges_px is not None

@@ -23,7 +23,7 @@ _NORMAL_95 = 1.959964
 class WholeFieldSummary:
     """Errors of the whole displacement, rms per component over the material's pixels.
 
-    Regions are those of scores. Two runs differ in nothing but ``seconds``.
+    Regions are those of scores.
     """
 
     rms_px: float = quantity("whole displacement: truth − measured, rms", "px")
@@ -46,8 +46,6 @@ class WholeFieldSummary:
     library: str
     """That factorised the matrices."""
     warnings: tuple[str, ...]
-    seconds: float
-    """Of the measurement, on this machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +79,6 @@ class WholeFieldNumbers:
     start: str
     """Where the measurement began, in words."""
     warnings: tuple[str, ...]
-    seconds: float
-    """Of the measurement, on this machine."""
 
 
 def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> WholeFieldNumbers:
@@ -103,7 +99,7 @@ def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> Who
             _both_ways(whole.refit, correlated, i) for i in range(len(whole.refit.ansatz.modes))
         ),
         **picked(measured, "cutoff_px unknowns residual_rms library warnings"),
-        **picked(whole, "start seconds"),
+        start=whole.start,
     )
 
 
@@ -172,7 +168,6 @@ def compare_whole(
         interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in by_region else None,
         mode=_square_mode(refit, specimen.pitch),
         **picked(measured, "cutoff_px unknowns contradicted library warnings"),
-        seconds=whole.seconds,
     )
 
 

@@ -34,7 +34,6 @@ FORMAT = "modeharvest-nodal-displacement-3"
 _TYPES = get_type_hints(NodalResult)
 _ARRAYS = [name for name, kind in _TYPES.items() if kind == FloatArray]
 _PLAIN = [name for name in _TYPES if name not in (*_ARRAYS, "mesh", "roots")]
-"""Two measurements leave the same bytes, so their seconds are kept elsewhere."""
 _VECTORS = {
     "displacement": ("u", "v up"),
     "standard_deviation": ("sd_u", "sd_v"),
@@ -59,7 +58,7 @@ NO_MORE = Given()
 
 
 def write_result(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> None:
-    """Write all of a result but its seconds as HDF5, losslessly and atomically.
+    """Write all of a result as HDF5, losslessly and atomically.
 
     For readers without modeharvest also all fields that follow.
     """

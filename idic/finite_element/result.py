@@ -177,8 +177,6 @@ class WholeField:
 
     measured: NodalResult
     refit: Result
-    seconds: float = float("nan")
-    """What the measurement took."""
     start: str = ""
     """Where the measurement began, in words."""
 

@@ -304,7 +304,6 @@ class MeasureRun(StagedRun[MeasureCase]):
             **picked(result, "residual_rms residual_noise library"),
             "gain": float(gain),
             "offset": float(offset),
-            "seconds": self.timings.get(f"image {name}"),
             "image_noise": noise,
             "warnings": [*result.warnings, *misfit_of(result, noise, f[material])],
         }

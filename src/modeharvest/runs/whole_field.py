@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields, replace
@@ -31,7 +30,7 @@ from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import make_folder, read_json, write_json
+from modeharvest.util.files import make_folder
 from modeharvest.util.machine import available_bytes, is_alone
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.summary import MeasuredExperiment
@@ -117,7 +116,7 @@ def name_of(strain: float) -> str:
 
 @dataclass(frozen=True)
 class WholeFields:
-    """The files of whole displacements in a folder, by the names of images, and what they took."""
+    """The files of whole displacements in a folder, by the names of images."""
 
     folder: Path
 
@@ -129,15 +128,12 @@ class WholeFields:
         """The JSON file of a correlation that took the place of one that had gone astray."""
         return self.folder / f"{name_of(strain)}_result.json"
 
-    def write(
-        self, name: str, found: NodalResult, given: Given, seconds: float
-    ) -> tuple[Path, Path]:
-        """Write what was found in an image, and what that took; returns the files."""
+    def write(self, name: str, found: NodalResult, given: Given) -> tuple[Path, Path]:
+        """Write what was found in an image; returns the files."""
         path = self.path(name)
         make_folder(self.folder)
         write_result(path, found, given=given)
         write_vtu(path.with_suffix(".vtu"), found, given=given)
-        write_json(self._timing(name), {"seconds": seconds})
         return path, path.with_suffix(".vtu")
 
     def of_images(
@@ -179,20 +175,12 @@ class WholeFields:
         known, name = comparisons[k], name_of(comparisons[k].strain)
         found, true, fit = self.read(name), known.displacement, known.result
         refit = refitted(found, fit.ansatz, fit.unknowns, known.mask)
-        whole = WholeField(found, refit, self.seconds(name))
+        whole = WholeField(found, refit)
         return whole, compare_whole(whole, true, known.best, known.mask, measured.specimen)
 
     def read(self, name: str) -> NodalResult:
         """The whole displacement of an image; InputError if its file is missing or damaged."""
         return read_result(self.path(name))
-
-    def seconds(self, name: str) -> float:
-        """What its measurement took [s]."""
-        path = self._timing(name)
-        return float(read_json(path)["seconds"]) if path.exists() else float("nan")
-
-    def _timing(self, name: str) -> Path:
-        return self.folder / f"{name}_timings.json"
 
 
 def _measure(
@@ -203,7 +191,7 @@ def _measure(
     images, law = ImageSet.read(folder), None if how.law is None else how.law.material
 
     def one(strain: float, result: Result) -> None:
-        begin, of = time.perf_counter(), f"strain {100 * strain:.2f} %"
+        of = f"strain {100 * strain:.2f} %"
 
         def report(done: float, total: float, what: str) -> None:
             progress(done, total, f"{what}, {of}")
@@ -218,8 +206,7 @@ def _measure(
             result, _ = refitted_correlation(found, pair, *where, correlation.options())
             make_folder(files.folder)
             result.write(files.result_path(strain))
-        given, seconds = Given(material=law, correlation=result), time.perf_counter() - begin
-        files.write(name_of(strain), found, given, seconds)
+        files.write(name_of(strain), found, Given(material=law, correlation=result))
 
     for strain, result in results.items():
         one(strain, result)

@@ -14,7 +14,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -220,8 +219,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             result, field, refit = self._paths(name)
             wholes, whole = self._wholes, None
             if start["whole"]:
-                again = wholes.read(name), Result.read(refit), wholes.seconds(name)
-                whole = WholeField(*again, start["whole"])
+                whole = WholeField(wholes.read(name), Result.read(refit), start["whole"])
             text, warnings = tuple(start["text"]), tuple(start["warnings"])
             return MeasuredPhotograph(Result.read(result), read_field(field), text, whole, warnings)
 
@@ -240,7 +238,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
         One that can't be measured so keeps its modes, and has a warning.
         """
-        case, begin, refit = self.case, time.perf_counter(), self._paths(name)[-1]
+        case, refit = self.case, self._paths(name)[-1]
         try:
             with with_remedy(name):
                 found = measure_whole(
@@ -250,8 +248,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         except InputError as error:
             return replace(first, warnings=(*first.warnings, str(error))), ()
         assert found.whole
-        given, seconds = Given(correlation=found.result), time.perf_counter() - begin
-        files = self._wholes.write(name, found.whole.measured, given, seconds)
+        given = Given(correlation=found.result)
+        files = self._wholes.write(name, found.whole.measured, given)
         found.whole.refit.write(refit)
         return found, (*files, refit)
 
