@@ -13,6 +13,7 @@ import h5py
 import meshio
 import numpy as np
 import pytest
+from documented_keys import undocumented
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -294,6 +295,7 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     assert "phi1 is not observable" in summary["warnings"][0], "four holes are few"
     assert {s["negative_eigenvalues"] for s in summary["states"]} == {0}
     require_exported(out, summary)
+    assert undocumented(summary, "homogenization.md") == set()
     # The same mode from its file: without the images it was measured in, and their strain.
     result = out / "experiment/correlation/result_1300.json"
     one = SMALL.replace('"measured"', f'"file"\npath = "{result}"')
