@@ -232,6 +232,7 @@ def test_a_pattern_and_its_mirror_image_are_one() -> None:
         ({"mode": {"kind": "guessed"}}, "expected a mode kind among"),
         ({"homogenization": {"mesh_size": 0.0}}, "mesh_size"),
         ({"homogenization": {"centre": "ligament"}}, "centre"),
+        ({"homogenization": {"centre": [1e9, 0.0]}}, r"a centre \[mm\] of -3.8 to 3.8, got 1"),
         ({"homogenization": {"quater": True}}, "did you mean 'quarter'"),
     ],
 )

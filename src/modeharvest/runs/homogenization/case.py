@@ -222,6 +222,9 @@ class HomogenizationCase(CaseModel):
                 "homogenization: expected quarter = true for a guided specimen, whose middle line "
                 "stays straight, got false"
             )
+        for x in () if isinstance(self.centre, str) else self.centre:
+            most = 2.0 * specimen.pitch
+            require_within("homogenization: expected a centre [mm]", x, -most, most)
         if isinstance(self.mode, MeasuredMode) and self.correlation.fixed_mode:
             raise InputError("mode: expected a free mode to be measured, got fixed_mode = true")
         strain = getattr(self.mode, "strain", None)
