@@ -30,7 +30,6 @@ from modeharvest.util.progress import Progress, silent
 
 _BEYOND_PX = 2.0
 """How far beyond the mesh's edge its fields are continued: the edge is known to half a pixel."""
-_CHUNK = 500_000
 _STEP = 1e-5
 """Of a mode's parameters, for derivatives: these are of waves a few dozen radians long."""
 WHOLE = "the whole displacement"
@@ -86,8 +85,15 @@ class NodalResult:
         located = locate(mesh.nodes, mesh.cells, mesh.element, grid)
         flat = np.ascontiguousarray(nodal.reshape(len(nodal), -1))
         values = interpolate(located, mesh.cells, mesh.element, flat)
-        _continue(mesh, grid, located, flat, values)
+        if grid not in self._beside:
+            self._beside[grid] = _beside(mesh, grid, located)
+        _continue(self._beside[grid], flat, values)
         return np.moveaxis(values, 0, -1).reshape(*grid.shape, *nodal.shape[1:])
+
+    @cached_property
+    def _beside(self) -> dict[PixelGrid, tuple[NDArray[Any], ...]]:
+        """The pixels beside the mesh, of grids that were asked for."""
+        return {}
 
     def at(self, points: FloatArray, nodal: FloatArray | None = None) -> FloatArray:
         """(k, ...) nodal fields (n, ...), by default u [mm], at points (k, 2) [mm]; or NaN."""
@@ -97,12 +103,8 @@ class NodalResult:
         mesh, nodal = self.mesh, self.displacement if nodal is None else nodal
         row, col = self.grid.to_px(points[:, 0], points[:, 1])
         found = locate_points(mesh.nodes, mesh.cells, mesh.element, self.grid, row[None], col[None])
-        element, xi = found.element[0], found.xi[0]
-        values = np.full((len(points), *nodal.shape[1:]), np.nan)
-        there = element >= 0
-        N = shape_functions(mesh.element, xi[there])
-        values[there] = np.einsum("ka,ka...->k...", N, nodal[mesh.cells[element[there]]])
-        return values
+        values = interpolate(found, mesh.cells, mesh.element, nodal.reshape(len(nodal), -1))
+        return values[:, 0].T.reshape(len(points), *nodal.shape[1:])
 
     def displacement_on(self, grid: PixelGrid | None = None) -> FloatArray:
         """(rows, cols, 2) u at pixels [mm]."""
@@ -233,23 +235,22 @@ def refitted_correlation(
     return found, refit
 
 
-def _continue(
-    mesh: Mesh, grid: PixelGrid, located: Located, nodal: FloatArray, values: FloatArray
-) -> None:
-    """Fill pixels up to 2 px beside the mesh, by the polynomials of the nearest element."""
-    there = located.mask
-    distance, nearest = ndimage.distance_transform_edt(~there, return_indices=True)
+def _beside(mesh: Mesh, grid: PixelGrid, located: Located) -> tuple[NDArray[Any], ...]:
+    """Rows, columns (k,), of pixels up to 2 px beside the mesh; nearest elements' nodes and N."""
+    distance, nearest = ndimage.distance_transform_edt(~located.mask, return_indices=True)
     rows, cols = np.nonzero((distance > 0.0) & (distance <= _BEYOND_PX))
     element = located.element[tuple(nearest[:, rows, cols])]
     xi = _local_coordinates(mesh, element, np.stack(grid.to_mm(rows, cols), axis=1))
-    for begin in range(0, rows.size, _CHUNK):
-        part = np.s_[begin : begin + _CHUNK]
-        N, own = shape_functions(mesh.element, xi[part]), nodal[mesh.cells[element[part]]]
-        # A polynomial through values that change much within an element runs away from them.
-        least, most = own.min(axis=1), own.max(axis=1)
-        reach = 0.5 * (most - least)
-        found = np.clip(np.einsum("ka,kac->kc", N, own), least - reach, most + reach)
-        values[:, rows[part], cols[part]] = found.T
+    return rows, cols, mesh.cells[element], shape_functions(mesh.element, xi)
+
+
+def _continue(beside: tuple[NDArray[Any], ...], nodal: FloatArray, values: FloatArray) -> None:
+    """Fill pixels beside the mesh, by the polynomials of the nearest element."""
+    rows, cols, nodes, N = beside
+    own = nodal[nodes]
+    # A polynomial through values that change much within an element runs away from them.
+    found, reach = np.einsum("ka,kac->kc", N, own), 0.5 * np.ptp(own, axis=1)
+    values[:, rows, cols] = np.clip(found, own.min(axis=1) - reach, own.max(axis=1) + reach).T
 
 
 def _local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
@@ -261,6 +262,6 @@ def _local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) ->
         F = np.einsum("kai,kaj->kij", x, shape_gradients(mesh.element, xi))
         step = np.linalg.solve(F, off[..., None])[..., 0]
         xi = np.clip(xi - step, -1.0, 2.0)
-        if abs(step).max(initial=0.0) < 1e-12:  # in local coordinates: settled
+        if abs(step).max(initial=0.0) < 1e-7:  # Newton's next one would be of its square
             break
     return xi
