@@ -77,13 +77,10 @@ def boundary_sides(mesh: Mesh) -> IntArray:
 
     The material lies to their left; without mid-side nodes the second column repeats the first.
     """
-    corners = 3 if mesh.element in ("T3", "T6") else 4
-    has_middle = mesh.cells.shape[1] > corners
-    sides = []
-    for k in range(corners):
-        a, b = mesh.cells[:, k], mesh.cells[:, (k + 1) % corners]
-        sides.append(np.stack([a, mesh.cells[:, corners + k] if has_middle else a, b], axis=1))
-    every = np.vstack(sides)
+    k = np.arange(3 if mesh.element in ("T3", "T6") else 4)
+    middle = k + k.size if mesh.cells.shape[1] > k.size else k
+    every = mesh.cells[:, np.stack([k, middle, np.roll(k, -1)], axis=1)]
+    every = every.swapaxes(0, 1).reshape(-1, 3)  # side by side
     pairs = np.sort(every[:, [0, 2]], axis=1)
     _, number, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
     return np.asarray(every[count[number.ravel()] == 1])

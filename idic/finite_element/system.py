@@ -33,6 +33,7 @@ from scipy.sparse import csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.idic.finite_element.fields import nodal_sums
 from modeharvest.idic.finite_element.pixels import MeshPixels, NodalEquations
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
@@ -111,10 +112,9 @@ def _interleave(indptr: Any, parts: Any, data: Any) -> None:
 
 def interior_sides(cells: IntArray) -> IntArray:
     """(s, 4) first cell, its side 0 ... 2, second cell and its side, of sides between two cells."""
-    corners = np.sort(np.stack([cells[:, [k, (k + 1) % 3]] for k in range(3)], axis=1), axis=2)
-    flat = corners.reshape(-1, 2)
-    order = np.lexsort(flat.T)
-    same = (flat[order[1:]] == flat[order[:-1]]).all(axis=1)
+    middle = cells[:, 3:].ravel()
+    order = np.argsort(middle, kind="stable")
+    same = middle[order[1:]] == middle[order[:-1]]
     first, second = order[:-1][same], order[1:][same]
     return np.stack([first // 3, first % 3, second // 3, second % 3], axis=1)
 
@@ -189,13 +189,6 @@ class SmoothnessRoots(NamedTuple):
         return nodal_sums(self.size, self.nodes, random).reshape(2 * self.size, count)
 
 
-def nodal_sums(count: int, nodes: IntArray, values: FloatArray) -> FloatArray:
-    """(count, s) sums of values (m, k, s) over the nodes (m, k) that they belong to."""
-    flat = nodes.ravel()
-    ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (count, flat.size))
-    return np.asarray(ones @ values.reshape(flat.size, values.shape[2]))
-
-
 class Body:
     """A T6 mesh of the material, with what all measurements on it share: patterns, the factor."""
 
@@ -212,8 +205,8 @@ class Body:
         """(2 n, 2 n) R of both components, and (2 n, SAMPLES) random vectors of that covariance."""
         edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
         self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
-        """Of the waves by which data and smoothness are compared [mm]."""
-        self._waves = _waves(mesh.nodes, self.wavelength)
+        """Of waves along x and y, of both components, that compare data and smoothness [mm]."""
+        self._waves = np.kron(np.cos(2.0 * np.pi / self.wavelength * mesh.nodes), np.eye(2))
         self._factor: Factor | None = None
         self._factorised: tuple[csr_array, csr_array, float] | None = None
         self._stored = 0
@@ -252,38 +245,25 @@ class Body:
         self._factorised = M, R, weight
         return self._factor
 
-    def smoothed(self, u: FloatArray, cutoff: float, known: BoolArray | None = None) -> FloatArray:
+    def smoothed(self, u: FloatArray, cutoff: float, known: BoolArray | bool = True) -> FloatArray:
         """(n, 2) u less waves shorter than a cut-off [mm], from nodes (n,) where it is known."""
-        there = np.ones(u.size) if known is None else np.repeat(known, 2).astype(float)
-        one, R = csr_array(diags_array(there)), self.smoothness
+        node = np.repeat(np.arange(len(u)), np.diff(self.pattern.indptr))
+        own = (self.pattern.indices == node) & np.broadcast_to(known, len(u))[node]
+        one, R = self.pattern.matrix(own * np.array([[1.0], [0.0], [1.0]])), self.smoothness
         if not R.data.any():  # a single element
             return u
         weight = (cutoff / self.wavelength) ** Smoothness.power * self.energies(one)
-        return (
-            self.factor(one, R, weight / self.energies(R)).solve(there * u.ravel()).reshape(-1, 2)
-        )
+        return self.factor(one, R, weight / self.energies(R)).solve(one @ u.ravel()).reshape(-1, 2)
 
     def samples(self, blocks: FloatArray) -> FloatArray:
         """(2 n, SAMPLES) random vectors of the covariance M, given by its blocks."""
         n, m, count = len(self.mesh.nodes), len(blocks), SAMPLES
-        parts = np.empty((m, 6, 2, 6, 2))
-        for c in (0, 1):
-            for d in (0, 1):
-                parts[:, :, c, :, d] = blocks[:, c + d]
-        M = parts.reshape(m, 12, 12)
+        M = blocks[:, [[0, 1], [1, 2]]].transpose(0, 3, 1, 4, 2).reshape(m, 12, 12)
         # Elements with few pixels have singular blocks.
         M[:, range(12), range(12)] *= 1.0 + 1e-9
         M[:, range(12), range(12)] += 1e-12 * M.max()
         z = np.linalg.cholesky(M) @ np.random.default_rng(0).standard_normal((m, 12, count))
         return nodal_sums(n, self.mesh.cells, z.reshape(m, 6, 2 * count)).reshape(2 * n, count)
-
-
-def _waves(nodes: FloatArray, wavelength: float) -> FloatArray:
-    """(2 n, 4) waves along x and y, of displacements along x and y."""
-    waves = np.zeros((len(nodes), 2, 4))
-    for k in range(4):
-        waves[:, k % 2, k] = np.cos(2.0 * np.pi / wavelength * nodes[:, k // 2])
-    return waves.reshape(-1, 4)
 
 
 class Smoothness:
