@@ -30,8 +30,8 @@ from modeharvest.idic.finite_element.pixels import (
     NONE_CONTINUED,
     ContinuedPixels,
     ElementPixels,
-    continued,
     continued_pixels,
+    continued_spline,
     images_on,
     normal_equations,
 )
@@ -64,8 +64,9 @@ _SHORT_PX = 0.1
 shorter; rms over the nodes [px]."""
 _LEAST_DET = 0.1
 """Elements that shrink to less are an iteration gone astray."""
-_UNLIKE = 0.25
-"""Mean square residual of an element, over the reference's variance, where images don't match."""
+_UNLIKE, _SEEN = 0.25, 0.25
+"""Images don't match in an element with a larger mean square residual, over the reference's
+variance, or with a smaller share of its pixels found on the deformed image's material."""
 _ROUNDS = 3
 _SETTLED = 0.5
 """Relative change of the cut-off wavelength that needs no other round."""
@@ -175,8 +176,9 @@ def coarse_displacement(
     course = _Measurement(pair, start, on, options)
     for stage in (*_STAGES, _Stage(FULL, _FIRST_PX)):
         course.through(stage)
-    sums, grey = course.linearised().sums, course._prepare(FULL).pixels.grey
-    unlike = sums.squares > _UNLIKE * float(grey.var()) * sums.weights
+    sums, pixels = course.linearised().sums, course._prepare(FULL).pixels
+    unlike = sums.squares > _UNLIKE * float(pixels.grey.var()) * sums.weights
+    unlike |= sums.counts < _SEEN * np.diff(pixels.start)
     return course.u.reshape(-1, 2), ~np.isin(np.arange(len(on.mesh.nodes)), on.mesh.cells[unlike])
 
 
@@ -239,7 +241,7 @@ class _Measurement:
     def _weighed_by_reference(self, on: _LevelOnMesh) -> _LevelOnMesh:
         """Weigh the residual by the reference's gradient, blurred as noise asks for."""
         f, mask, px = self.pair.reference, self.pair.masks[0], self.pair.grid.pixel_size
-        spline = SplineImage.of(continued(f, mask), self.order)
+        spline = continued_spline(f, mask, self.order)
         _, d_row, d_col = spline.sample(on.pixels.row, on.pixels.col)
         noise, noise_g = self.noise
         square = 0.5 * float(np.mean(d_row**2 + d_col**2)) - noise * slope_noise(self.order, 0.0)

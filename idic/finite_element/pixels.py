@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, eroded, level_pair
+from modeharvest.idic.solver.pyramid import FELT, FULL, Level, LevelPair, eroded, level_pair
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.imaging.spline import SplineImage, sample_points
+from modeharvest.imaging.spline import SplineImage, border_reach, sample_points
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.compiled import compiled, in_parallel, readable
 from modeharvest.util.errors import InputError
@@ -53,13 +53,20 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     edge_px : pixels closer than this to the mask's edge are left out on the finest level [px].
     order : of the spline.
     """
-    found = level_pair(pair, level, edge_px, order)
-    mask = pair.deformed_mask
-    if level != FULL or mask is None or mask.all():
+    found, mask = level_pair(pair, level, edge_px, order), pair.masks[1]
+    if level != FULL:
         return found
-    g = SplineImage.of(continued(pair.deformed, mask), order)
-    border = found.valid if found.valid is None else ndimage.binary_dilation(found.valid)
-    return replace(found, deformed=g, valid=border)
+    valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
+    g = continued_spline(pair.deformed, mask, order)
+    return replace(found, deformed=g, valid=None if valid.all() else valid)
+
+
+def continued_spline(image: FloatImage, mask: BoolArray, order: int) -> SplineImage:
+    """The spline through an image (rows, cols), continued beyond its material and its border."""
+    width = border_reach(order, FELT)
+    framed = continued(np.pad(image, width), np.pad(mask, width))
+    inner = SplineImage.of(framed, order).coefficients[width:-width, width:-width]
+    return SplineImage(np.ascontiguousarray(inner), order)
 
 
 class ContinuedPixels(NamedTuple):

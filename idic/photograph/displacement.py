@@ -66,8 +66,9 @@ _BLUR_PX, _SPECKLE = 1.5, 3.0
 """Of the reference, and the power of its slopes over that of noise, where there is speckle."""
 _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which they don't match."""
-_OFF_PX, _AT_EDGE_PX = (4.0, 2.0), 1.0
-"""By how much edges may be off where blocks of speckle, a first and a second measurement say."""
+_OFF_PX, _AT_EDGE_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0), 1.0
+"""By how much edges may be off where blocks of speckle say, and as many measurements as it takes
+until the images match everywhere, or no better; and the last one."""
 _UNLIKE, _ROUNDS = 4.5, 4
 """Residual over its median, 3 standard deviations of noise, beyond which pixels don't match."""
 _SAMPLES, _LEAST = 100_000, 0.1
@@ -93,10 +94,14 @@ def displacement_from(
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(alike, deformed_mask=mask)
 
-    for off_px in _OFF_PX if pair.deformed_mask is None else ():
+    unknown = len(start)
+    for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
         u, known = coarse_displacement(seen(off_px), start, body, options=_FIRST)
-        if not known.all():  # they are tried again from where their neighbours are
-            start = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
+        # Where the images don't match it is tried again from where the neighbours are.
+        start = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
+        before, unknown = unknown, int((~known).sum())
+        if sweep and not 0 < unknown < before:
+            break
     return measure_displacement(seen(_AT_EDGE_PX), start, body, options=options, progress=progress)
 
 
@@ -204,8 +209,8 @@ def _alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair
 def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatArray, FloatArray]:
     """Gain [-] and offset [grey levels], (rows, cols), that make g(x + u) as bright as f.
 
-    Both have the same mean and the same contrast, polynomials of a degree fitted to the pixels: so
-    a displacement that is off by some pixels hardly matters. Edges and what doesn't match don't
+    Polynomials of a degree, with which both images have the same mean and the same contrast: so a
+    displacement that is off by some pixels hardly matters. Edges and what doesn't match don't
     count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known.
     """
     grid, inner = pair.grid, shrunk(pair.masks[0], _OFF_PX[0])
@@ -219,17 +224,16 @@ def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatAr
     row, col = (places[::every] for places in np.nonzero(inner))
     basis = field.basis(grid.x[col], grid.y[row])
     for _ in range(_ROUNDS):
-        mean = np.linalg.lstsq(basis[there], both[there])[0]
-        less = both - basis @ mean
-        contrast = np.linalg.lstsq(basis[there], np.abs(less[there]))[0]
-        seen = basis @ contrast
-        off = np.abs(less[:, 0] - seen[:, 0] / seen[:, 1] * less[:, 1])
+        within = basis[there]
+        mean = within @ np.linalg.lstsq(within, both[there])[0]
+        f, g = np.abs(both[there] - mean).T
+        gain = np.linalg.lstsq(within.T @ (g[:, None] * within), within.T @ f)[0]
+        left = both[:, 0] - basis @ gain * both[:, 1]
+        offset = np.linalg.lstsq(within, left[there])[0]
+        off = np.abs(left - basis @ offset)
         there = off <= _UNLIKE * np.nanmedian(off)
-    f, g, *contrasts = (
-        field.evaluate(part, grid.x[None], grid.y[:, None]) for part in (*mean.T, *contrast.T)
-    )
-    gain = np.divide(*(np.maximum(part, _LEAST * part.mean()) for part in contrasts))
-    return gain, f - gain * g
+    a, b = (field.evaluate(part, grid.x[None], grid.y[:, None]) for part in (gain, offset))
+    return np.maximum(a, _LEAST * a.mean()), b
 
 
 def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:

@@ -117,7 +117,7 @@ FULL = Level(1, 0.0)
 COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL)
 """Blurs of 24, 12, 6 and 0 px."""
 
-_FELT, _MOST = 2e-3, 1 / 16
+FELT, _MOST = 2e-3, 1 / 16
 """On the finest level no pixel counts that is mapped to where the spline of g feels the mirror
 image beyond the border by more than 0.2 % of its pull: 8 px for a quintic spline, 5 for a cubic.
 The rest of it moves float images by 5e-6 px. At most a sixteenth of the image's shorter side: in
@@ -177,7 +177,7 @@ def level_pair(
 
 def _valid(mask: BoolArray | None, shape: tuple[int, int], edge_px: int, order: int) -> BoolArray:
     """Where g may be sampled: away from its border, and from the edges of its mask if known."""
-    border = min(border_reach(order, _FELT), int(_MOST * min(shape)))
+    border = min(border_reach(order, FELT), int(_MOST * min(shape)))
     valid = np.zeros(shape, dtype=np.bool_)
     interior = (slice(border, shape[0] - border), slice(border, shape[1] - border))
     # The reference's eroded edge lands near edge_px from the edge of g, give or take the
