@@ -184,7 +184,6 @@ def compare(before: Path, after: Path, tolerance: float) -> int:
         for path in sorted(before.rglob("*"))
         if path.suffix in READ
         and path.name not in NOT_COMPUTED
-        and not path.name.endswith("_timings.json")
         and not any(DIGEST.fullmatch(Path(p).stem) for p in path.relative_to(before).parts)
     ]
     for old in files:
