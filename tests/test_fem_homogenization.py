@@ -282,6 +282,22 @@ def test_a_critical_point_of_u_alone_does_not_hide_the_pattern_s() -> None:
     assert found.states[0].negative_eigenvalues > 0  # bowing is not followed
 
 
+def test_an_unstable_rve_does_not_hide_that_the_pattern_grows_before() -> None:
+    """One long step, at whose end RVEs are unstable, too."""
+    thin = RVE(
+        square(1.9, 1.65, 0.5).enlarged(2, 2), Ogden(), [rotation_pattern(1.9)], (0.95, 0.95)
+    )
+    body = HomogenizedBody.of_specimen(
+        Specimen(3, 4, diameter=1.65), thin, PlateLoading(quarter=True)
+    )
+    path = HomogenizedPath(body)
+    assert path.follow_primary(0.1, "all")
+    assert path.states[-1].rve_negative > 0
+    found = path.critical()
+    assert found is not None
+    assert (found.kind, found.negative_before, found.negative_after) == ("pattern", 0, 1)
+
+
 def test_a_plate_s_force_is_the_derivative_of_the_energy() -> None:
     """In bending, shear and compression, on the buckled branch too."""
     for loading in (PlateLoading(), PlateLoading(0, 1), PlateLoading(0.5, 0, 1, plates="sliding")):

@@ -231,9 +231,10 @@ class HomogenizedPath:
         # The block of v alone first: its eigenvalue is smooth where modes of u are lower.
         parts = ["pattern", block] if ends[1].pattern_negative else [block]
         if block == "all" and ends[1].rve_negative > calm:
-            parts = ["RVE"]
+            parts = ["RVE", *parts]
+        between = [state.load for state in ends]
         for part in parts:
-            find, between = bisect if part == "RVE" else brentq, [state.load for state in ends]
+            find = bisect if part == "RVE" else brentq
             try:
                 load = float(find(measure, *between, (part,), xtol=0.2 * tolerance))
                 after, before = at(load + tolerance), at(load - tolerance)
@@ -243,6 +244,8 @@ class HomogenizedPath:
                 modes, kind = self._critical_modes(block) if part != "RVE" else (_NONE, part)
                 counts = before.negative_eigenvalues, after.negative_eigenvalues
                 return HomogenizedCritical(load, kind, before, modes, *counts)
+            if part == "RVE":  # the whole is unstable before
+                between[1] = before.load
         return None
 
     def _critical_modes(self, block: str) -> tuple[FloatArray, str]:
