@@ -29,7 +29,7 @@ from modeharvest.report.homogenization import homogenization_report
 from modeharvest.report.model import print_report
 from modeharvest.runs.homogenization.case import FileMode, HomogenizationCase
 from modeharvest.runs.homogenization.pipeline import HomogenizationRun
-from modeharvest.runs.homogenization.results import aligned
+from modeharvest.runs.homogenization.results import aligned, not_reached
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.validation.homogenization import (
@@ -260,6 +260,14 @@ def test_the_number_of_a_mode_may_be_large() -> None:
         assert tracemalloc.get_traced_memory()[1] < 5e6
     finally:
         tracemalloc.stop()
+
+
+def test_states_that_were_not_reached_are_warned_of() -> None:
+    response = {"states": [{}], "outcome": "no equilibrium beyond the load 0.1"}
+    assert not_reached(response, 1) == []
+    assert not_reached(response, 3) == [
+        "2 of 3 states were not reached: no equilibrium beyond the load 0.1"
+    ]
 
 
 @pytest.mark.dolfinx

@@ -45,6 +45,7 @@ from modeharvest.runs.homogenization.export import write_fe2, write_rve
 from modeharvest.runs.homogenization.results import (
     HomogenizationData,
     HomogenizedFields,
+    not_reached,
     response_of,
     summary_of,
     write_fields,
@@ -460,7 +461,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             path={} if solution is None else solution.info["path"],
             modes=modes,
             parameters=parameters,
-            warnings=warnings,
+            warnings=(*warnings, *not_reached(found["response"], len(self.case.loads))),
             fields=fields,
             measured=self.result if is_compared else None,
             measured_strain=self._measured_strain,

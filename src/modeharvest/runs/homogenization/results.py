@@ -157,6 +157,13 @@ class HomogenizationData:
         return np.hstack([of.v0(a, x, y)[:, 0], of.v(0, a, x, y)])
 
 
+def not_reached(response: Mapping[str, Any], count: int) -> list[str]:
+    """A warning if there are fewer states than the ``count`` that was asked for."""
+    found = len(response["states"])
+    text = f"{count - found} of {count} states were not reached: {response['outcome']}"
+    return [text] if found < count else []
+
+
 def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) -> dict[str, Any]:
     """The content of ``summary.json``."""
     found, response = data.found, data.found["response"]
