@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,10 @@ COMMANDS = (
     ("image",),
     ("correlate",),
     ("validate",),
+    ("homogenize",),
     ("benchmark", "make"),
+    ("benchmark", "star"),
+    ("benchmark", "resolution"),
     ("score",),
     ("cases",),
 )
@@ -59,8 +63,13 @@ def test_help_lists_every_command(
 def test_every_command_has_help(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     assert called(monkeypatch, *command, "--help") == 0
-    assert f" {' '.join(command)} [OPTIONS]" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert f" {' '.join(command)} [OPTIONS]" in shown
+    lines = [line.strip() for line in shown.partition("╭")[0].splitlines()]
+    for line, after in pairwise(lines):  # no line ends where the next word had its place, too
+        assert not (line and after) or len(line) + 1 + len(after.split()[0]) > 78
 
 
 def test_help_does_not_wait_for_what_only_the_work_needs() -> None:

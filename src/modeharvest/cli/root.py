@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import os
 import signal
 import sys
@@ -65,6 +66,9 @@ def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
         except KeyboardInterrupt as error:
             raise messages.InterruptionError from error
 
+    # The library would keep the source's line breaks, in a terminal of any width.
+    paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
+    run_command.__doc__ = "\n\n".join(" ".join(text.split()) for text in paragraphs)
     return run_command
 
 

@@ -175,16 +175,6 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
     several, is_lattice = state.amplitudes.shape[1] > 1, np.isfinite(state.amplitudes[:, 0])
     fields = {f"v{k} homogenized" if several else "homogenized": v
               for k, v in enumerate(state.amplitudes.T, start=1)}  # fmt: skip
-    means = dict[str, FloatArray]()
-    if data.compared is not None:
-        measured = np.where(is_lattice[:, None], data.measured_at(mesh.nodes), np.nan)
-        for k, name in enumerate("xy"):
-            u = np.where(is_lattice, state.displacement[:, k], np.nan)
-            means |= {f"u{name} homogenized": u, f"v0{name} measured": measured[:, k]}
-        if not several:
-            names = "homogenized", "measured in the images"
-            both = aligned(state.amplitudes[:, 0], measured[:, 2])
-            fields = dict(zip(names, both, strict=True))
 
     def drawn(kind: str, fields: dict[str, FloatArray]) -> list[ReportFigure]:
         every = np.concatenate([values[np.isfinite(values)] for values in fields.values()])
@@ -196,6 +186,16 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
             for k, (label, values) in enumerate(fields.items(), start=1)
         ]
 
+    means = list[ReportFigure]()
+    if data.compared is not None:
+        measured = np.where(is_lattice[:, None], data.measured_at(mesh.nodes), np.nan)
+        for k, axis in enumerate("xy"):
+            u = np.where(is_lattice, state.displacement[:, k], np.nan)
+            both = {f"u{axis} homogenized": u, f"v0{axis} measured": measured[:, k]}
+            means += drawn(f"mean-{axis}", both)
+        if not several:
+            names = "homogenized", "measured in the images"
+            fields = dict(zip(names, aligned(state.amplitudes[:, 0], measured[:, 2]), strict=True))
     at, points = f"at {100 * state.load:.4g} %", data.fields.points
     places = [np.argmin(points @ sign) for sign in np.array([(1, 1), (-1, 1), (1, -1), (-1, -1)])]
     rves = [
@@ -207,7 +207,7 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
     ]  # fmt: skip
     cards = [("Amplitudes" if several else "Amplitude v₁", drawn("amplitude", fields), "fields")]
     if means:
-        cards.append(("Mean displacement v₀", drawn("mean", means), "means"))
+        cards.append(("Mean displacement v₀", means, "means"))
     cards.append(("Microstructure", rves, "microstructure"))
     return [Card(f"{name} {at}", made, wide=True, caption=text_of(f"homogenized-{text}"))
             for name, made, text in cards]  # fmt: skip
