@@ -22,6 +22,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.bernstein import require_positive_jacobian
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import large_parts, opened
 
 find_contours: Any = measure.find_contours
 
@@ -73,7 +74,7 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, 
     length along edges [px].
     """
     changes = []
-    kept = mask | ~_large(~mask, _LEAST_HOLE * element_px**2)
+    kept = mask | ~large_parts(~mask, _LEAST_HOLE * element_px**2)
     filled = int((kept & ~mask).sum())
     if filled:
         changes.append(
@@ -84,7 +85,7 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, 
     for radius in _OPENINGS_PX:
         if _narrowest(wide) >= _NARROWEST_PX:
             break
-        wide = _opened(kept, radius)
+        wide = opened(kept, radius, at_border=True)
     if wide is not kept:
         changes.append(
             f"Material narrower than {2.0 * radius:g} px was left out, "
@@ -92,7 +93,7 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, 
         )
         kept = wide
     least = _MARGIN * _LEAST_ISLAND * element_px**2
-    large = _large(kept, least)
+    large = large_parts(kept, least)
     small, count = ndimage.label(kept & ~large)
     if count and large.any():
         sizes = np.bincount(small.ravel())[1:]
@@ -105,22 +106,6 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, 
         )
         kept = large
     return kept, tuple(changes)
-
-
-def _opened(mask: BoolArray, radius: float) -> BoolArray:
-    """What of a mask a disk of this radius [px] can cover; beyond the image there is none."""
-    core = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] > radius
-    if not core.any():
-        return np.zeros_like(mask)
-    return np.asarray(mask & (ndimage.distance_transform_edt(~core) <= radius))
-
-
-def _large(mask: BoolArray, least_px: float) -> BoolArray:
-    """A mask's connected parts of at least so many pixels."""
-    parts, _ = ndimage.label(mask)
-    large = np.bincount(parts.ravel()) >= least_px
-    large[0] = False
-    return np.asarray(large[parts])
 
 
 def mesh_of_mask(

@@ -32,6 +32,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.masks import room_around
 
 
 def predicted_sd(
@@ -188,9 +189,7 @@ def _largest_motion(pair: ImagePair) -> int:
 
 def _seeds(mask: BoolArray, subset_px: int) -> list[tuple[int, int]]:
     """(col, row) of places with most material around, far from each other; the best first."""
-    padded = np.pad(mask, 1)
-    room = np.asarray(ndimage.distance_transform_cdt(padded, "chessboard"))[1:-1, 1:-1].copy()
-    seeds = []
+    room, seeds = room_around(mask), list[tuple[int, int]]()
     for _ in range(_TRIES):
         row, col = np.unravel_index(int(np.argmax(room)), room.shape)
         if 2 * room[row, col] - 1 < subset_px:

@@ -34,7 +34,6 @@ from modeharvest.idic.photograph.matching import (
     match_blocks,
     require_same_surface,
 )
-from modeharvest.idic.photograph.material import shrunk
 from modeharvest.idic.solver.noise import estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import smoothed
 from modeharvest.imaging.grid import PixelGrid
@@ -43,6 +42,7 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import shrunk
 from modeharvest.util.progress import Progress, silent
 
 _FAR_PX = 4 * REACH_PX

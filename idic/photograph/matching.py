@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.interpolate import RBFInterpolator
-from scipy.ndimage import distance_transform_cdt, map_coordinates
+from scipy.ndimage import map_coordinates
 
 from modeharvest.idic.local.field import LocalField, field_between
 from modeharvest.idic.local.motion import Slow
@@ -28,6 +28,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import room_around
 
 _ALIKE = 0.4
 """Relative change of the lattice vectors beyond which two lattices are not the same specimen's."""
@@ -287,8 +288,7 @@ def _best(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, B
 
 def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
     """(centres (n, 2), half an edge) of blocks on material, spread over the image."""
-    padded = np.pad(material, 1)  # the image's border counts as an edge
-    room = np.asarray(distance_transform_cdt(padded, "chessboard"))[1:-1, 1:-1]
+    room = room_around(material)
     cell = max(8, int(np.sqrt(material.size / count)))
     rows, cols = (n // cell for n in material.shape)
     tiles = room[: rows * cell, : cols * cell].reshape(rows, cell, cols, cell).swapaxes(1, 2)

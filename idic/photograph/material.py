@@ -12,49 +12,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, label, uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 from skimage.filters import threshold_otsu
 
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
-
-
-def grown(mask: BoolArray, px: float) -> BoolArray:
-    """The mask and all pixels within this distance of it [px].
-
-    As ``skimage.morphology.isotropic_dilation``, which makes pixels of an empty mask.
-    """
-    if not mask.any():  # has no distance
-        return mask
-    return np.asarray(distance_transform_edt(~mask) <= px)
-
-
-def shrunk(mask: BoolArray, px: float) -> BoolArray:
-    """The mask without the pixels within this distance of the rest [px]."""
-    return ~grown(~mask, px)
-
-
-def opened(mask: BoolArray, radius: float) -> BoolArray:
-    """What of a mask a disk of this radius [px] can cover without leaving it."""
-    return grown(shrunk(mask, radius), radius)
-
-
-def without_small(mask: BoolArray, px: int) -> BoolArray:
-    """The mask without connected parts of up to ``px`` pixels."""
-    parts, _ = label(mask)
-    keep = np.bincount(parts.ravel()) > px
-    keep[0] = False
-    return np.asarray(keep[parts])
-
-
-def connected_to(seed: BoolArray, mask: BoolArray) -> BoolArray:
-    """The connected parts of a mask that share a pixel with ``seed``."""
-    parts, count = label(mask)
-    keep = np.zeros(count + 1, dtype=np.bool_)
-    keep[np.unique(parts[seed])] = True
-    keep[0] = False
-    return np.asarray(keep[parts])
-
+from modeharvest.util.masks import connected_to, grown, large_parts, opened, shrunk
 
 _WINDOW_SHARE, _WIDEST_PX = 0.15, 25
 """Buckled holes are narrow: a share of a cell fits into them, and the widest window is enough."""
@@ -176,13 +139,13 @@ def _refined(grey: FloatImage, sure: BoolArray, window: int) -> tuple[BoolArray,
     half = 0.5 * float(np.quantile(away[some][inside], 0.01))
     background = _background(away < np.maximum(tolerance, half), sure, _REACH * window)
     share = float((away < tolerance)[some][inside].mean())
-    return without_small(~background, window**2), share
+    return large_parts(~background, window**2 + 1), share
 
 
 def _background(alike: BoolArray, sure: BoolArray, reach: float) -> BoolArray:
     """What has the background's grey level far and wide, or is connected to what surely is it."""
-    wide = opened(~without_small(~alike, _SPECK_PX2), reach)
-    return connected_to(sure, wide) | without_small(wide, int(_WIDE * np.pi * reach**2))
+    wide = opened(~large_parts(~alike, _SPECK_PX2 + 1), reach)
+    return connected_to(sure, wide) | large_parts(wide, int(_WIDE * np.pi * reach**2) + 1)
 
 
 def _without_walls(grey: FloatImage, material: BoolArray, window: int) -> tuple[BoolArray, float]:
@@ -202,7 +165,7 @@ def _without_walls(grey: FloatImage, material: BoolArray, window: int) -> tuple[
     background = ~material
     wall = opened(dull, 0.25 * narrow) & connected_to(background, dull | background)
     # Near the edge this window holds some sharp material: a wall ends a little further on.
-    rest = without_small(material & ~grown(wall, 0.45 * narrow), window**2)
+    rest = large_parts(material & ~grown(wall, 0.45 * narrow), window**2 + 1)
     return rest, float((material & ~rest).sum() / material.sum())
 
 

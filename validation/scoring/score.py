@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.specimen import Specimen
@@ -23,6 +22,7 @@ from modeharvest.idic.spectra.spectrum import gridded, spectral_density
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import grown, shrunk
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 
@@ -46,9 +46,7 @@ def regions(mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int =
     labels[mask & ~cellular] = REGIONS.index(BULK)
     row, col = np.nonzero(mask & cellular)
     labels[row, col] = _nearest(specimen, np.stack([grid.x[col], grid.y[row]], axis=1))
-    padded = np.pad(mask, 1)
-    near = ndimage.distance_transform_edt(padded)[1:-1, 1:-1] <= edge_px
-    labels[mask & near] = REGIONS.index(EDGES)
+    labels[mask & ~shrunk(mask, edge_px, at_border=True)] = REGIONS.index(EDGES)
     return labels
 
 
@@ -241,11 +239,9 @@ def _to_nearest(points: FloatArray) -> FloatArray:
 def _near(field: LocalField, used: BoolArray, reach_px: float, grid: PixelGrid) -> BoolArray:
     """(rows, cols) True where a used point is no farther."""
     row, col = grid.to_px(field.x[used], field.y[used])
-    missed = np.ones(grid.shape, dtype=np.bool_)
-    missed[np.rint(row).astype(int), np.rint(col).astype(int)] = False
-    if missed.all():
-        return ~missed
-    return np.asarray(ndimage.distance_transform_edt(missed) <= reach_px)
+    met = np.zeros(grid.shape, dtype=np.bool_)
+    met[np.rint(row).astype(int), np.rint(col).astype(int)] = True
+    return grown(met, reach_px)
 
 
 BANDS_AN_OCTAVE = 3

@@ -1,0 +1,56 @@
+"""Masks as sets of pixels: grown, shrunk, opened; their connected parts, the room in them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import distance_transform_cdt, distance_transform_edt, label
+
+from modeharvest.util.arrays import BoolArray, IntArray
+
+
+def grown(mask: BoolArray, px: float) -> BoolArray:
+    """The mask and all pixels within this distance of it [px].
+
+    As ``skimage.morphology.isotropic_dilation``, which makes pixels of an empty mask.
+    """
+    if not mask.any():  # has no distance
+        return mask
+    return np.asarray(distance_transform_edt(~mask) <= px)
+
+
+def shrunk(mask: BoolArray, px: float, *, at_border: bool = False) -> BoolArray:
+    """The mask without the pixels within this distance of the rest [px].
+
+    ``at_border``: what lies beyond the image belongs to the rest.
+    """
+    if at_border:
+        return shrunk(np.pad(mask, 1), px)[1:-1, 1:-1]
+    return ~grown(~mask, px)
+
+
+def opened(mask: BoolArray, radius: float, *, at_border: bool = False) -> BoolArray:
+    """What of a mask a disk of this radius [px] can cover without leaving it, as ``shrunk``."""
+    return grown(shrunk(mask, radius, at_border=at_border), radius)
+
+
+def large_parts(mask: BoolArray, least_px: float) -> BoolArray:
+    """A mask's connected parts of at least so many pixels."""
+    parts, _ = label(mask)
+    keep = np.bincount(parts.ravel()) >= least_px
+    keep[0] = False
+    return np.asarray(keep[parts])
+
+
+def connected_to(seed: BoolArray, mask: BoolArray) -> BoolArray:
+    """The connected parts of a mask that share a pixel with ``seed``."""
+    parts, count = label(mask)
+    keep = np.zeros(count + 1, dtype=np.bool_)
+    keep[np.unique(parts[seed])] = True
+    keep[0] = False
+    return np.asarray(keep[parts])
+
+
+def room_around(mask: BoolArray) -> IntArray:
+    """(rows, cols) distance to what is off the mask or beyond the image, in king's moves [px]."""
+    distance = distance_transform_cdt(np.pad(mask, 1), "chessboard")
+    return np.asarray(distance[1:-1, 1:-1], dtype=np.int64)
