@@ -149,7 +149,8 @@ def measured(pair: ImagePair, specimen: Specimen, true: FloatArray, noise: float
     each = {name: [*zip(*map(partial(of, name), both), strict=True)] for name in errors}
     parts = ({name: values[k] for name, values in each.items()} for k in range(3))
     refit = refitted_against(start, refitted(found, ansatz, start.unknowns, pair.masks[0]))
-    return Row(noise, seed, found.cutoff_px, *parts, refit)  # type: ignore[arg-type]
+    covered, error, deviation = parts
+    return Row(noise, seed, found.cutoff_px, covered, error, deviation, refit)
 
 
 def refitted_against(best: Result, refit: Result) -> dict[str, tuple[float, float]]:
