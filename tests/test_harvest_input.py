@@ -18,8 +18,10 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.solver.noise import measured_noise
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs import prepare
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
+from modeharvest.util.errors import WriteError
 
 PITCH, PIXEL = 1.9, 0.035
 CELLULAR, DOMAIN = Box.centred(3 * PITCH, 4 * PITCH), Box.centred(3 * PITCH + 1.6, 4 * PITCH + 1.6)
@@ -174,6 +176,22 @@ def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
     assert "16 bits" in reasons["frame_1b.tif"]
     assert "100 x 100" in reasons["frame_2a.tif"]
     assert not any("\n" in reason for reason in reasons.values())
+
+
+def test_a_full_disk_skips_no_photograph(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case, write = PhotographCase.read(folder / "experiment.toml"), prepare.write_image
+
+    def refused(path: Path, image: np.ndarray) -> None:
+        if path.stem == "frame_2":
+            raise WriteError(f"could not write {path}: No space left on device")
+        write(path, image)
+
+    monkeypatch.setattr(prepare, "write_image", refused)
+    with pytest.raises(WriteError, match="No space left"):
+        _ = HarvestRun(case, folder / "out").prepared
+    monkeypatch.undo()
+    prepared = HarvestRun(case, folder / "out").prepared
+    assert (prepared.names, prepared.skipped) == (("frame_1", "frame_2", "frame_3"), ())
 
 
 def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) -> None:

@@ -23,8 +23,8 @@ import synthetic_benchmark
 import modeharvest
 from modeharvest.cli.root import main
 from modeharvest.util import stages
-from modeharvest.util.errors import InputError
-from modeharvest.util.stages import Stages, exclusive, source_digest, stage_key
+from modeharvest.util.errors import InputError, WriteError
+from modeharvest.util.stages import StagedRun, Stages, exclusive, source_digest, stage_key
 
 
 class Work:
@@ -96,6 +96,26 @@ def test_a_stage_done_anew_takes_its_older_files_away_and_no_others(tmp_path: Pa
     assert not (folder / "a.txt").exists()
     assert (tmp_path / "outside.txt").exists()
     assert not Stages(folder).is_finished("one", "key")
+
+
+def test_what_the_disk_refuses_is_no_image_s_failure(tmp_path: Path) -> None:
+    """An image that can't be used is done with; one whose files can't be written is done again."""
+    errors = [WriteError("could not write a.h5: No space left on device")]
+
+    def work(name: str, _: object) -> tuple[list[Path], dict[str, str]]:
+        if errors:
+            raise errors.pop()
+        if name == "b":
+            raise InputError("of another size")
+        return [], {}
+
+    def done() -> object:
+        run, keys = StagedRun(None, tmp_path), {"a": "key", "b": "key"}
+        return run.do_in_turn("measure", keys, tmp_path, work, lambda name, _: name)
+
+    with pytest.raises(WriteError, match="No space left"):
+        done()
+    assert done() == ({"a": "a"}, {"b": "of another size"})
 
 
 def test_seconds_are_apart(tmp_path: Path) -> None:

@@ -32,6 +32,10 @@ def require_within(
     raise InputError(f"{what} {limits}, got {value}")
 
 
+class WriteError(InputError):
+    """A file can't be written, as on a full disk: no fault of what was given, so not its result."""
+
+
 class MissingDependencyError(ImportError):
     """An optional library is needed for this step; the message says how to get it."""
 

@@ -30,7 +30,7 @@ import psutil
 from numpy.typing import NDArray
 
 from modeharvest.util import child
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, WriteError
 from modeharvest.util.machine import require_memory
 
 _CHILD_SECONDS, _CHILD_SECONDS_PER_BYTE = 60.0, 1e-5
@@ -179,7 +179,7 @@ def atomic(path: Path | str) -> Iterator[Path]:
         if os.name == "posix":  # elsewhere a folder can't be opened
             _flush(path.parent, os.O_RDONLY)
     except OSError as error:
-        raise InputError(f"could not write {path}: {error.strerror or error}") from error
+        raise WriteError(f"could not write {path}: {error.strerror or error}") from error
     finally:
         with suppress(OSError):  # it may never have been there, nor its folder
             temporary.unlink(missing_ok=True)

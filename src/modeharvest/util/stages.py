@@ -36,7 +36,7 @@ from typing import Any, Generic, TypeVar
 import psutil
 
 from modeharvest.util import __version__
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, WriteError
 from modeharvest.util.files import make_folder, read_json, remove_orphans, sha256_of, write_json
 from modeharvest.util.machine import on_first
 from modeharvest.util.progress import Progress, silent
@@ -191,7 +191,7 @@ class StagedRun(Stages, Generic[C]):
         ``keys``: by their names; ``work`` gets a name, and that of the last one with what was found
         there, leaves files, and returns them with the content of ``NAME_start.json`` in the folder
         ``records``; ``read`` reads them again. Returns what was found and why others failed: an
-        InputError of the work is taken down as ``failed``.
+        InputError of the work is taken down as ``failed``, unless its files couldn't be written.
         """
         found: dict[str, R] = {}
         failed: dict[str, str] = {}
@@ -199,6 +199,8 @@ class StagedRun(Stages, Generic[C]):
         def one(name: str, path: Path) -> Sequence[Path]:
             try:
                 files, about = work(name, next(reversed(found.items()), None))
+            except WriteError:
+                raise
             except InputError as error:
                 files, about = (), {"failed": str(error)}
             write_json(path, to_plain({"failed": "", **about}))

@@ -44,7 +44,7 @@ from modeharvest.imaging.photographs.photograph import (
 from modeharvest.report.model import text_of
 from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
 from modeharvest.util.arrays import BoolArray, FloatImage
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, WriteError
 from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import made, picked, to_plain
@@ -266,6 +266,8 @@ def prepare(
         try:
             frame = read_frame(path, reference)
             save(path.stem, frame, masks.get(path.stem))
+        except WriteError:
+            raise
         except InputError as error:
             skipped.append((path.name, str(error)))
             continue
