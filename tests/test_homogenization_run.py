@@ -25,6 +25,8 @@ from modeharvest.fem.lattice.options import equibiaxial
 from modeharvest.fem.materials import Ogden
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.modes import square_family
+from modeharvest.idic.spectra.mode_family import FoundFamily, write_family
 from modeharvest.report.homogenization import homogenization_report
 from modeharvest.report.model import print_report
 from modeharvest.runs.homogenization.case import FileMode, HomogenizationCase
@@ -537,6 +539,7 @@ def test_a_mesh_of_one_s_own_is_bent(tmp_path: Path) -> None:
     [
         ([[0, 0], [4, -3], [8, 0], [4, 3]], "expected supports that leave no rigid motion"),
         ([[0, 0], [0, 5], [8, 5], [8, 0]], "expected elements with positive Jacobians"),
+        ([[0, 0], [8e-3, 0], [8e-3, 5e-3], [0, 5e-3]], "got 0.005 mm; is it in metres?"),
         ([], "plate.vtu, found no such file"),
     ],
 )
@@ -583,6 +586,24 @@ def test_three_measured_modes_are_snapped_each(tmp_path: Path) -> None:
     off[12:16] += [0.0, 0.0, 0.3, 0.0]
     with pytest.raises(InputError, match=r"phi3: mode: expected wave vectors within 10%"):
         run._modes_of(off)
+
+
+@pytest.mark.dolfinx
+def test_families_of_modes_are_snapped_and_have_the_specimen_s_pitch(tmp_path: Path) -> None:
+    """A file each; the origin is a hole's centre, as that of the cells that they were found on."""
+    ideal, points = rotation_pattern(1.9), np.random.default_rng(0).uniform(-4, 4, (20, 2))
+    for k, pitch in ((1, 1.9), (2, 1.91)):
+        family = FoundFamily(square_family("hole"), pitch, 0.1, 1.0, (), ())
+        write_family(tmp_path / f"family_{k}.json", family)
+    text = SMALL.replace('"measured"', '"file"\npath = "family_*.json"')
+    case = case_of(tmp_path / "case.toml", text)
+    modes, parameters, _ = HomogenizationRun(case, tmp_path / "out")._found_modes()
+    assert parameters is None
+    assert [mode.wave_change.max() < 0.01 for mode in modes] == [True, True]
+    np.testing.assert_allclose(modes[0].snapped(points), -2 * ideal(points), atol=1e-12)
+    write_family(tmp_path / "family_3.json", replace(family, pitch=2.0))
+    with pytest.raises(InputError, match=r"the specimen's pitch, 1.9 mm, got 3 of 1.9, 1.91, 2 mm"):
+        HomogenizationRun(case, tmp_path / "out")._found_modes()
 
 
 @pytest.mark.dolfinx

@@ -107,8 +107,15 @@ class LatticeMode:
         """
         waves, hole = mode.family.waves(parameters), _central_hole(specimen)
         found = PlaneWaves.of_sines(waves, mode.half_wavelength, mode.scale).moved(-hole)
-        mode_found = cls(found, snapped(found, vectors, -hole, inversion_centre=(0.0, 0.0)))
-        if not (overlap := mode_found.overlap(snapped(found, vectors, -hole))) >= _LEAST_OVERLAP:
+        return cls.of_waves(found, vectors, -hole)
+
+    @classmethod
+    def of_waves(
+        cls, found: PlaneWaves, vectors: ArrayLike, about: ArrayLike = (0.0, 0.0)
+    ) -> LatticeMode:
+        """Of waves in the lattice's coordinates, whose phases are kept at a point; as ``of``."""
+        mode_found = cls(found, snapped(found, vectors, about, inversion_centre=(0.0, 0.0)))
+        if not (overlap := mode_found.overlap(snapped(found, vectors, about))) >= _LEAST_OVERLAP:
             raise InputError(
                 "mode: expected phases of the lattice, its holes at points of symmetry, got a "
                 f"pattern of which snapping them leaves {100 * overlap:.0f} % (overlap); take one "
@@ -252,26 +259,18 @@ def with_errors(
             J[:, k] = (predicted(there).values_at(response) - response.values) / step[k]
     variances, count = np.einsum("ik,kl,il->i", J, parameters.covariance, J), len(response.states)
     every = [_known(sd) for sd in np.sqrt(variances)]
-    states = tuple(
-        replace(s, force_sd_N_per_mm=force, energy_sd_N=energy)
-        for s, force, energy in zip(
-            response.states, every[1 : 1 + count], every[1 + count :], strict=True
-        )
-    )
+    pairs = zip(response.states, every[1 : 1 + count], every[1 + count :], strict=True)
+    states = tuple(replace(s, force_sd_N_per_mm=f, energy_sd_N=e) for s, f, e in pairs)
     effects = tuple(
         ParameterEffect(
-            name=parameters.names[k],
-            unit=parameters.units[k],
-            value=float(parameters.values[k]),
-            sd_noise=_known(sds[0][k]),
-            sd_model_error=_known(sds[1][k]),
-            snapped=bool(is_snapped[k]),
-            critical_strain=_known(J[0, k]),
+            name=parameters.names[k], unit=parameters.units[k], value=float(parameters.values[k]),
+            sd_noise=_known(sds[0][k]), sd_model_error=_known(sds[1][k]),
+            snapped=bool(is_snapped[k]), critical_strain=_known(J[0, k]),
             force=tuple(map(_known, J[1 : 1 + count, k])),
             energy=tuple(map(_known, J[1 + count :, k])),
         )
         for k in range(m)
-    )
+    )  # fmt: skip
     return replace(response, states=states, critical_strain_sd=every[0]), effects
 
 

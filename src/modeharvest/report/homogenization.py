@@ -125,10 +125,8 @@ def findings(summary: Summary) -> list[str]:
         if (both := summary[name]) is not None:
             share = 100 * both["difference_rms_mm"] / both["measured_rms_mm"]
             text.append(text_of(f"homogenized-{name}", share=share, **both))
-    text.append(
-        f"The specimen is of the {material_text(summary['case']['experiment']['material'])}."
-    )
-    return text
+    material = material_text(summary["case"]["experiment"]["material"])
+    return [*text, f"The specimen is of the {material}."]
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
@@ -145,8 +143,7 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
     if first is not None:
         keys.append(KeyNumber.of("first-order-critical", f"{100 * first:.3f}"))
     pairs = [(state, other) for state, other in _pairs(summary) if other is not None]
-    if pairs:
-        state, other = pairs[-1]
+    for state, other in pairs[-1:]:
         for name, key in (("force", "force_N_per_mm"), ("energy", "energy_N")):
             off = _off(state[key], other[key])
             keys.append(KeyNumber.of(f"{name}-off", f"{off:+.2f}",
@@ -180,10 +177,8 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
         every = np.concatenate([values[np.isfinite(values)] for values in fields.values()])
         scale, how = ColourScale.signed(every, "mm"), figures.draw_amplitude
         return [
-            ReportFigure(
-                f"{kind}-{k}", label, partial(how, mesh, state.displacement, values, scale)
-            )
-            for k, (label, values) in enumerate(fields.items(), start=1)
+            ReportFigure(f"{kind}-{k}", label, partial(how, mesh, state.displacement, v, scale))
+            for k, (label, v) in enumerate(fields.items(), start=1)
         ]
 
     means = list[ReportFigure]()
@@ -227,10 +222,7 @@ def _effect_row(effect: Mapping[str, Any]) -> Mapping[str, Any]:
            "noise": effect["sd_noise"], "model": effect["sd_model_error"]}  # fmt: skip
     if effect["snapped"]:
         return row | {"critical": "0 (snapped)", "force": "0 (snapped)", "energy": "0 (snapped)"}
-    slopes = {
-        "critical": (effect["critical_strain"], 100.0),
-        "force": (effect["force"][-1], 1.0),
-        "energy": (effect["energy"][-1], 1.0),
-    }
+    strain, force, energy = effect["critical_strain"], effect["force"][-1], effect["energy"][-1]
+    slopes = {"critical": (strain, 100.0), "force": (force, 1.0), "energy": (energy, 1.0)}
     known = {k: (slope, unit) for k, (slope, unit) in slopes.items() if slope is not None}
     return row if sd is None else row | {k: unit * slope * sd for k, (slope, unit) in known.items()}

@@ -49,10 +49,8 @@ def draw_response(
     for branch in (path[name] for name in path if name != "primary"):
         strain, values = np.array(branch["nominal_strain"]), np.array(branch[of_path])
         if critical is not None:
-            strain, values = (
-                np.append(critical, strain),
-                np.append(np.interp(critical, *first), values),
-            )
+            strain = np.append(critical, strain)
+            values = np.append(np.interp(critical, *first), values)
             ring(axes, 100 * critical, values[0])
         axes.plot(100 * strain, values, "s-", color=BLUE, lw=1.8, ms=3.5, label="direct, buckled",
                   markevery=slice(critical is not None, None))  # fmt: skip

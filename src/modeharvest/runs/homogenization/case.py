@@ -60,7 +60,14 @@ class FileMode(_Numbered):
 
     path: str
     """The result of a correlation or of a harvest as JSON, of a specimen whose middle is the
-    origin; or modes as HDF5, whose cell is the RVE. In a case file, relative to its folder."""
+    origin; modes as HDF5, whose cell is the RVE; or, as "family_mode_*.json", families of modes of
+    a cell with a hole at its origin. In a case file, relative to its folder."""
+
+    @property
+    def files(self) -> list[Path]:
+        """Those that the name stands for, in order; itself if there are none."""
+        named = Path(self.path)
+        return sorted(named.parent.glob(named.name)) or [named]
 
     @property
     def is_computed(self) -> bool:

@@ -89,22 +89,11 @@ def write_rve(
         file.attrs["strain_units"] = _named(m, "- - - -", "mm", "- -")
         file.attrs["stresses"] = _named(m, "P11 P12 P21 P22", "Pi{}", "Lambda{}x Lambda{}y")
         file.attrs["stress_units"] = _named(m, *["MPa MPa MPa MPa", "MPa/mm", "MPa MPa"])
-        _put(
-            file,
-            nodes=mesh.nodes,
-            cells=mesh.cells,
-            materials=np.zeros(len(mesh.cells), np.int64),
-            thickness=THICKNESS,
-            lattice=rve.cell.cell.lattice,
-            area=rve.area,
-            centre=rve.centre,
-            pairs=pairs,
-            shifts=-np.diff(periodicity.shift[pairs], axis=1)[:, 0],
-            fixed_node=pairs[0, 1],
-            modes=rve.shapes,
-            scales=rve.scales,
-            averages=rve.averages,
-        )
+        materials, shifts = np.zeros(len(mesh.cells), np.int64), periodicity.shift[pairs]
+        _put(file, nodes=mesh.nodes, cells=mesh.cells, materials=materials, thickness=THICKNESS)
+        _put(file, lattice=rve.cell.cell.lattice, area=rve.area, centre=rve.centre)
+        _put(file, pairs=pairs, shifts=shifts[:, 0] - shifts[:, 1], fixed_node=pairs[0, 1])
+        _put(file, modes=rve.shapes, scales=rve.scales, averages=rve.averages)
         law = file.create_group("material/0")
         law.attrs.update(material_table(rve.material))
         law.attrs["law"] = inspect.getdoc(rve.material) or ""
@@ -182,8 +171,7 @@ def write_fe2(path: Path | str, rve: RVE) -> None:
         },
         "phi": phi,
     }}  # fmt: skip
-    law = rve.material
-    if isinstance(law, TwoTermI1):
+    if isinstance(law := rve.material, TwoTermI1):
         row = [2.0, law.c1, law.c2, 0.0, 0.0, 0.0, law.bulk, THICKNESS]
         content["microMaterials"] = np.array([row])
     memory = io.BytesIO()

@@ -30,6 +30,8 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.modes import FAMILIES
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.idic.spectra.mode_family import FORMAT as FAMILY_FORMAT
+from modeharvest.idic.spectra.mode_family import read_family
 from modeharvest.idic.uncertainty.covariance import Covariance, covariance
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.imageset import ImageSet
@@ -136,12 +138,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             found = self._followed(body, "homogenized specimen")
             response, effects = response_of(found), tuple[ParameterEffect, ...]()
             if parameters is not None and how.error_bars:
-                response, effects = with_errors(
-                    response,
-                    parameters,
-                    self._modes_of,
-                    partial(self._predicted, what="error bars"),
-                )
+                predicted = partial(self._predicted, what="error bars")
+                response, effects = with_errors(response, parameters, self._modes_of, predicted)
             first = self._followed(self._body([]), "first order") if how.first_order else None
             content = to_plain({
                 "response": response,
@@ -198,7 +196,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         plain, mode = self.case.plain(), self.case.mode
         depends: list[Any] = [plain["mode"]]
         if isinstance(mode, FileMode):
-            depends.append(sha256_of(mode.path))
+            depends += map(sha256_of, mode.files)
         if isinstance(mode, MeasuredMode):
             depends += [plain["experiment"], plain["imaging"], plain["correlation"]]
         return stage_key([*depends, plain["experiment"]["specimen"]])
@@ -241,6 +239,22 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         return given
 
     @cached_property
+    def _families(self) -> list[PlaneWaves]:
+        """Waves of the modes whose families are given, in the lattice's coordinates."""
+        mode, pitch = self.case.mode, self.case.experiment.specimen.pitch
+        if not isinstance(mode, FileMode) or mode.is_computed:
+            return []
+        if read_json(mode.files[0]).get("format") != FAMILY_FORMAT:
+            return []
+        found, count = [read_family(path) for path in mode.files], max(mode.numbers, default=1)
+        if len(found) < count or any(abs(f.pitch / pitch - 1.0) > _SAME for f in found):
+            got = f"{len(found)} of {', '.join(f'{f.pitch:g}' for f in found)} mm"
+            what = f"{count} or more families of the specimen's pitch, {pitch:g} mm"
+            raise InputError(f"{mode.path}: expected {what}, got {got}")
+        numbers = mode.numbers or range(1, len(found) + 1)
+        return [PlaneWaves.of_sines(found[k - 1].waves, found[k - 1].pitch) for k in numbers]
+
+    @cached_property
     def _primitive(self) -> UnitCell:
         """One cell of the specimen's lattice, a hole's centre at the origin."""
         with requiring_dolfinx("homogenization needs"):
@@ -261,7 +275,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         """The correlation that the mode was measured by, if it was."""
         mode = self.case.mode
         if isinstance(mode, FileMode):
-            return None if mode.is_computed else Result.read(mode.path)
+            return None if mode.is_computed or self._families else Result.read(mode.path)
         if not isinstance(mode, MeasuredMode):
             return None
         return self.virtual.correlate()[self._measured_strain]
@@ -293,14 +307,16 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         return tuple(found)
 
     def _found_modes(self) -> FoundModes:
-        result, specimen = self.result, self.case.experiment.specimen
+        result, specimen, vectors = self.result, self.case.experiment.specimen, self._cell.lattice
         if isinstance(self.case.mode, AnalyticMode) and not specimen.is_staggered:
             ideal = rotation_pattern(specimen.pitch)
             return (LatticeMode(ideal, ideal),), None, ()
         if isinstance(self.case.mode, AnalyticMode):
-            ideal_modes, vectors = Ansatz.of_specimen(specimen).modes, self._cell.lattice
-            ideals = [(ideal_modes[k], ideal_modes[k].family.start) for k in self._numbers]
+            every = Ansatz.of_specimen(specimen).modes
+            ideals = [(every[k], every[k].family.start) for k in self._numbers]
             return tuple(LatticeMode.of(*s, specimen, vectors) for s in ideals), None, ()
+        if self._families:
+            return tuple(LatticeMode.of_waves(w, vectors) for w in self._families), None, ()
         if result is None:
             return (), None, ()
         modes, numbers = result.ansatz.modes, self._numbers
@@ -409,6 +425,9 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         if how.mesh is None:
             return HomogenizedBody.of_specimen(specimen, rves, plates, divisions=how.divisions)
         mesh, is_lattice, edges = read_body_mesh(how.mesh)
+        if (extent := float(np.ptp(mesh.nodes, axis=0).min())) < specimen.pitch:
+            what = f"a body of at least one cell, {specimen.pitch:g} mm"
+            raise InputError(f"{how.mesh}: expected {what}, got {extent:.3g} mm; is it in metres?")
         return HomogenizedBody(
             mesh, rves, plates, bulk=experiment.material, is_lattice=is_lattice, edges=edges
         )
