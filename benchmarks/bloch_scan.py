@@ -5,8 +5,9 @@ zone's boundary, assembly and all, with 60 sparse factorisations of the reduced 
 order of elimination is known, or found anew each time. They take turns in one process, and the
 ratios are medians over the turns.
 ``… critical`` prints the table of docs/bloch.md, ``… rates`` the order of convergence on nested
-meshes, ``… splitting`` what a mesh does to a degenerate set, and ``… study`` ten lattices under
-three loadings with the time and the memory they take.
+meshes, ``… splitting`` what a mesh does to a degenerate set, ``… distances`` which branches are
+found from loads that aren't critical, and ``… study`` ten lattices under three loadings with the
+time and the memory they take.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import gmsh
 import numpy as np
 from refinement import refined_cell
 
+from modeharvest.fem.bloch import postbuckling
 from modeharvest.fem.bloch.critical import critical_at, first_critical
 from modeharvest.fem.bloch.degenerate import distinct_combinations
 from modeharvest.fem.bloch.dispersion import ZONES, zone_path
@@ -29,7 +31,7 @@ from modeharvest.fem.bloch.postbuckling import follow
 from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.lattice.bloch_map import factorise
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
-from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.cells import UnitCell, chiral, hexagonal, square
 from modeharvest.fem.lattice.files import cell_from_gmsh
 from modeharvest.fem.lattice.options import (
     CriticalSearch,
@@ -143,23 +145,29 @@ def rates(count: int) -> None:
     print(f"| {families[0][0]} | compressible | equibiaxial | {values}", flush=True)
 
 
+def rhombus(size: float, ratio: float = 0.9) -> UnitCell:
+    """A cell of hexagonal stacking as gmsh meshes it, without the lattice's symmetry."""
+    vectors = np.array([[1.0, 0.0], [0.5, 0.75**0.5]])
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    occ, r = gmsh.model.occ, 0.5 * ratio
+    ends = [occ.addPoint(*(p @ vectors), 0.0) for p in ([0, 0], [1, 0], [1, 1], [0, 1])]
+    sides = [occ.addLine(*pair) for pair in zip(ends, ends[1:] + ends[:1], strict=True)]
+    plate = occ.addPlaneSurface([occ.addCurveLoop(sides)])
+    holes = [occ.addDisk(*(p @ vectors), 0.0, r, r) for p in ([0, 0], [0, 1], [1, 0], [1, 1])]
+    occ.cut([(2, plate)], [(2, hole) for hole in holes])
+    occ.synchronize()
+    cell = cell_from_gmsh(vectors, size)
+    gmsh.finalize()
+    return cell
+
+
 def splitting(size: float) -> None:
     """By how much gmsh's mesh of a rhombus splits the three M points of hexagonal stacking.
 
     And which branches start at the critical load of the first one.
     """
-    vectors = np.array([[1.0, 0.0], [0.5, 0.75**0.5]])
-    gmsh.initialize(interruptible=False)
-    gmsh.option.setNumber("General.Terminal", 0)
-    occ = gmsh.model.occ
-    ends = [occ.addPoint(*(r @ vectors), 0.0) for r in ([0, 0], [1, 0], [1, 1], [0, 1])]
-    sides = [occ.addLine(*pair) for pair in zip(ends, ends[1:] + ends[:1], strict=True)]
-    plate = occ.addPlaneSurface([occ.addCurveLoop(sides)])
-    holes = [occ.addDisk(*(r @ vectors), 0.0, 0.45, 0.45) for r in ([0, 0], [0, 1], [1, 0], [1, 1])]
-    occ.cut([(2, plate)], [(2, hole) for hole in holes])
-    occ.synchronize()
-    cell = cell_from_gmsh(vectors, size)
-    gmsh.finalize()
+    cell = rhombus(size)
     path = CellPath(PeriodicCell(cell, TwoTermI1()), equibiaxial())
     found = first_critical(path)
     print(f"size {size}: {found.outcome}", end="; ")
@@ -169,6 +177,41 @@ def splitting(size: float) -> None:
     for row in distinct_combinations(copies, modes):
         branch = follow(CellPath(copies, equibiaxial()), modes, row, [1.2 * modes.load])
         print(f"    {row}: {branch.outcome}", flush=True)
+
+
+SHARES = (1.0, 0.99, 0.97, 0.9)
+"""Of a critical load."""
+
+
+def distances() -> None:
+    """How far from critical the modes of other loads are, and the branches found from there."""
+    postbuckling._CRITICAL = np.inf  # nothing is refused
+    print("| lattice | loading |", *(f"from {share:.0%}: distance, energy |" for share in SHARES))
+    print("|---|---|" + "---|" * len(SHARES))
+    for name, cell, loading in (
+        ("square 0.7895", square(1.0, 0.7895, 1 / 8), "uniaxial"),
+        ("square 0.7895", square(1.0, 0.7895, 1 / 8), "equibiaxial"),
+        ("square 0.95", square(1.0, 0.95, 1 / 8), "uniaxial"),
+        ("hexagonal 0.924", hexagonal(1.386, 1.28, 1.386 / 8), "equibiaxial"),
+        ("hexagonal 0.924", hexagonal(1.386, 1.28, 1.386 / 8), "uniaxial"),
+        ("hexachiral", chiral(1.9, 0.095, 6), "strain"),
+        ("rhombus 0.9", rhombus(0.1), "equibiaxial"),
+        ("rhombus 0.7", rhombus(0.1, 0.7), "equibiaxial"),
+    ):
+        path = CellPath(PeriodicCell(cell, TwoTermI1()), LOADINGS[loading])
+        found, texts = first_critical(path, CriticalSearch(divisions=2)), []
+        for share in SHARES:
+            state = found.state if share == 1.0 else path.at(share * found.load)
+            modes = real_modes(path.cell, state, found.waves)
+            whole = PeriodicCell(cell.enlarged(*modes.info["copies"]), TwoTermI1())
+            copies = CellPath(whole, LOADINGS[loading])
+            before = copies.at((1.0 - 1e-4) * modes.load)
+            assert before is not None
+            far = whole.critical_distances(before, modes.shapes, modes.eigenvalues).max()
+            along = np.eye(len(modes.waves))[0].tolist()
+            (reached,) = follow(copies, modes, along, [1.2 * found.load]).states
+            texts.append(f"{far:.2%}, {reached.energy:.9g}")
+        print(f"| {name} | {loading} | {' | '.join(texts)} |", flush=True)
 
 
 def study() -> None:
@@ -186,9 +229,12 @@ def study() -> None:
     print(f"\n{passed:.0f} s, {used:.0f} s of one core, {peak:.0f} MiB at the most")
 
 
+WHAT = ("cost", "critical", "rates", "splitting", "distances", "study")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("what", choices=["cost", "critical", "rates", "splitting", "study"])
+    parser.add_argument("what", choices=WHAT)
     parser.add_argument("--sizes", type=int, nargs="+", default=(12, 24), help="elements a pitch")
     parser.add_argument("--meshes", type=int, default=4, help="number of nested meshes")
     asked = parser.parse_args()
@@ -201,6 +247,8 @@ def main() -> None:
     elif asked.what == "splitting":
         for size in (0.1, 0.06):
             splitting(size)
+    elif asked.what == "distances":
+        distances()
     else:
         study()
 

@@ -179,6 +179,23 @@ def test_the_branch_ends_where_material_would_run_into_itself() -> None:
     assert closed[2] is True
 
 
+@pytest.mark.parametrize("case", ["thick", "flower", "across"])
+def test_critical_loads_are_as_far_as_the_modes_eigenvalues_say(case: str) -> None:
+    """To first order in the distance; a mode is critical where it is 0."""
+    cell, loading = CASES[case]
+    path, modes = start(case)
+    primitive = PeriodicCell(cell, TwoTermI1())
+    waves = first_critical(CellPath(primitive, loading), CriticalSearch(divisions=2)).waves
+    for share, order in ((1.0, 1e-7), (0.995, 5e-4), (0.98, 5e-3)):
+        state = CellPath(primitive, loading).at(share * modes.load)
+        before = path.at((share - 1e-4) * modes.load)
+        assert state is not None
+        assert before is not None
+        there = real_modes(primitive, state, waves)
+        found = path.cell.critical_distances(before, there.shapes, there.eigenvalues)
+        assert found == pytest.approx(1.0 / share - 1.0, abs=order)
+
+
 def test_what_cannot_be_followed_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     path, modes = start("flower")
     noise = np.random.default_rng(1).normal(size=modes.shapes.shape)
@@ -187,6 +204,7 @@ def test_what_cannot_be_followed_is_an_outcome(monkeypatch: pytest.MonkeyPatch) 
     assert "perhaps no branch starts along this combination" in lost.outcome
     stiff = follow(path, replace(modes, eigenvalues=modes.eigenvalues + 1.0), (1, 0, 0), [0.01])
     assert stiff.outcome.startswith("not followed: the modes are not critical")
+    assert "one mode's own critical load is " in stiff.outcome
     beyond = follow(path, replace(modes, load=3.0), (1, 0, 0), [4.0])
     assert beyond.outcome.startswith("not followed: no equilibrium of the primary path")
     monkeypatch.setattr(postbuckling, "_FARTHEST", 0.02)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import foreign_cells as made
@@ -15,6 +16,7 @@ from modeharvest.fem.bloch.critical import first_critical
 from modeharvest.fem.bloch.degenerate import Degeneracy, Transport, distinct_combinations
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves
 from modeharvest.fem.bloch.mesh_error import elements_across, ligament_notes, load_error, refined
+from modeharvest.fem.bloch.postbuckling import follow
 from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.field import Mesh, with_mid_sides
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
@@ -132,6 +134,21 @@ def test_a_triple_split_by_the_mesh_is_recognised_and_its_splitting_bounded() ->
     assert len(exact.waves) == 3
     assert exact.splitting < 1e-8
     assert exact.splitting_bound < 1e-8
+
+
+def test_branches_of_several_modes_that_a_mesh_splits_say_what_to_do() -> None:
+    cell = made.hexagonal_one()
+    path = path_of(cell, equibiaxial())
+    found = first_critical(path, QUICK)
+    modes = real_modes(path.cell, found.state, found.waves)
+    copies, loads = path_of(cell.enlarged(2, 2), equibiaxial()), [1.2 * modes.load]
+    single = follow(copies, modes, (0, 1, 0), loads)  # not the lowest one, and followed too
+    assert len(single.states) == 1
+    assert single.states[0].energy < single.states[0].primary_energy
+    flower = follow(copies, modes, (1, 1, 1), loads)
+    assert flower.states == ()
+    said = r"the mesh splits these modes by 0\.\d+ of the load.*mesh one sector of the cell"
+    assert re.search(said, flower.outcome)
 
 
 def test_the_bound_is_one_and_a_symmetric_mesh_attains_it() -> None:

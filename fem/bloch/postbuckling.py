@@ -29,7 +29,9 @@ from modeharvest.util.progress import Progress, silent
 _FIRST, _LONGEST, _FARTHEST = 0.01, 0.02, 0.4
 _GROWTH = 1.6  # of the step from one point to the next
 _BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
-_CRITICAL = 1e-2  # of the eigenvalues' scale: what a mode of a set that the mesh splits may have
+# Of the load: how far off a mode's own critical load may be, where a mesh splits a set (from 10 %
+# off the same branches are found, docs/modes.md), and a splitting that isn't rounding.
+_CRITICAL, _SPLIT = 3e-2, 1e-5
 _NEAR = 0.5  # of a step: how far from where it is expected a point may be
 _REFINEMENTS = 6
 
@@ -100,6 +102,10 @@ class _Tracing:
         start, last = self.points[0], self.points[-1]
         if len(self.points) == 1:
             why = f"{self.stopped}; perhaps no branch starts along this combination of the modes"
+            if self.splitting > _SPLIT:
+                by = f"{self.splitting:.1g} of the load"
+                why = f"the mesh splits these modes by {by}, so branches start along single ones: "
+                why += "for this one mesh one sector of the cell, and turn and mirror it"
             return f"not followed from the load {start.load:.6g} on: {why}"
         way = "rises" if self.points[1].load > start.load else "falls"
         text = f"the load {way} from {start.load:.6g} on; followed to {last.load:.6g}, "
@@ -139,15 +145,16 @@ class _Tracing:
         if not self.primary.states:
             self.stopped = f"no equilibrium of the primary path near the load {load:.6g}"
             return None
-        below = self.primary.states[0]
-        scale = np.linalg.norm(below.moduli) / (self.cell.filling * self.cell.cell.area)
-        largest = float(np.abs(self.modes.eigenvalues[self.mix != 0]).max())
-        if largest > _CRITICAL * scale:
-            where, size = f"at the load {load:.6g}", f"{largest:.3g} N/mm^4"
-            self.stopped = f"the modes are not critical {where}, their largest eigenvalue is {size}"
+        below, along = self.primary.states[0], self.mix != 0
+        distances = self.cell.critical_distances(
+            below, self.modes.shapes[along], self.modes.eigenvalues[along]
+        )
+        if (farthest := float(np.abs(distances).max())) > _CRITICAL:
+            off = f"one mode's own critical load is {farthest:.2g} of it off"
+            self.stopped = f"the modes are not critical at the load {load:.6g}: {off}"
             return None
-        value = _stacked(below.gradient, below.fluctuation)
-        value += (load - below.load) * _stacked(below.gradient_rate, below.fluctuation_rate)
+        self.splitting = float(np.ptp(distances))
+        value = below.value + (load - below.load) * below.rate
         self.origin = value[4:]
         return BranchPoint(0.0, load, 0.0, value, self._direction(self.mix))
 
@@ -156,13 +163,14 @@ class _Tracing:
         periodicity, order = self.cell.reduction.periodicity, self.cell.reduction.order
         at_masters = np.empty((periodicity.count, 2))
         at_masters[periodicity.master] = np.tensordot(mix, self.modes.shapes, 1)
-        return _stacked(np.zeros((2, 2)), (at_masters - at_masters[0]).ravel()[order])
+        return np.concatenate([np.zeros(4), (at_masters - at_masters[0]).ravel()[order]])
 
     def _at_amplitude(self, points: Sequence[BranchPoint], amplitude: float) -> BranchPoint | str:
         """The point of the branch at an amplitude, from one or two before it; or why not."""
         weights, guess = self.mix @ self.weights, value_at(points, amplitude)
         prescribed = Amplitude(weights, amplitude + float(weights @ self.origin))
-        found = self._corrected(load_at(points, amplitude), guess, prescribed)
+        load = load_at(points, amplitude)
+        found = self.cell.corrected(self.loading, load, guess, prescribed)
         if isinstance(found, str):
             return found
         if self._overlaps(found):
@@ -170,23 +178,16 @@ class _Tracing:
         off = found.fluctuation - guess[4:]
         if off @ (self.mass @ off) > (_NEAR * (amplitude - points[-1].amplitude)) ** 2:
             return "another branch is nearer"
-        rate = float(weights @ found.fluctuation_rate)
-        value = _stacked(found.gradient, found.fluctuation)
-        value_rate = _stacked(found.gradient_rate, found.fluctuation_rate) / rate
-        return BranchPoint(amplitude, found.load, 1.0 / rate, value, value_rate)
-
-    def _corrected(
-        self, load: float, guess: FloatArray, amplitude: Amplitude | None = None
-    ) -> CellState | str:
-        F, w = guess[:4].reshape(2, 2), guess[4:]
-        return self.cell.corrected(self.loading, load, F, w, amplitude)
+        rate = float(weights @ found.rate[4:])
+        return BranchPoint(amplitude, found.load, 1.0 / rate, found.value, found.rate / rate)
 
     def _at_load(self, here: BranchPoint, there: BranchPoint, load: float) -> CellState | None:
         """The state between two points at a load, which one of them is below and one above."""
         for _ in range(_REFINEMENTS):
             between = (here, there)
             amplitude = amplitude_at(between, load, here.amplitude, there.amplitude)
-            found = self._corrected(load, value_at(between, amplitude))
+            guess = value_at(between, amplitude)
+            found = self.cell.corrected(self.loading, load, guess)
             if isinstance(found, CellState):
                 got = float(self.mix @ self.weights @ (found.fluctuation - self.origin))
                 # Under a prescribed load Newton may fall back to the primary path.
@@ -219,11 +220,6 @@ class _Tracing:
             displacement=u,
             amplitudes=self.weights @ (state.fluctuation - before),
         )
-
-
-def _stacked(gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
-    """F̄ (2, 2) and fluctuation as one vector."""
-    return np.concatenate([gradient.ravel(), fluctuation])
 
 
 def _check(

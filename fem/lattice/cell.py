@@ -35,17 +35,22 @@ class CellState:
     load: float
     """e; for compressions the nominal strain [-]."""
     gradient: FloatArray
-    gradient_rate: FloatArray
-    """(2, 2) F̄ and dF̄/de [-]."""
+    """(2, 2) F̄ [-]."""
     fluctuation: FloatArray
-    fluctuation_rate: FloatArray
-    """(2 count,) w of the masters as in ``Reduction``, dw/de [mm]."""
+    """(2 count,) w of the masters as in ``Reduction`` [mm]."""
+    rate: FloatArray
+    """(4 + 2 count,) derivatives of both by the load."""
     stress: FloatArray
     """(2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa]."""
     stiffness: csr_array
     """(2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2]."""
     moduli: FloatArray
     """(2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa]."""
+
+    @property
+    def value(self) -> FloatArray:
+        """(4 + 2 count,) F̄, then w."""
+        return np.concatenate([self.gradient.ravel(), self.fluctuation])
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +192,8 @@ class LinearisedCell(CondensedCell):
         return CellState(
             load=self.load,
             gradient=(Q @ self.gradient).reshape(2, 2),
-            gradient_rate=(Q @ self.rate).reshape(2, 2),
             fluctuation=self.fluctuation,
-            fluctuation_rate=self.response @ self.rate,
+            rate=np.concatenate([Q @ self.rate, self.response @ self.rate]),
             stress=np.asarray((Q @ self.macro_forces).reshape(2, 2) / self.area),
             stiffness=self.stiffness,
             moduli=(Q @ self.condensed @ Q.T).reshape(2, 2, 2, 2) / self.area,
@@ -198,6 +202,7 @@ class LinearisedCell(CondensedCell):
 
 _ITERATIONS = 12
 _SMALLEST_STEP = 1e-6  # of the load
+_BACK = 1e-4  # of the load: to where the rate of an eigenvalue is taken
 _NOT_CONVERGED = "Newton's method did not converge"
 _REVERSED = "an element would be turned inside out (det F <= 0)"
 
@@ -237,28 +242,25 @@ class PeriodicCell:
         self, loading: MacroLoading, load: float, near: CellState | None = None
     ) -> CellState | None:
         """The equilibrium at a load, from a state nearby; None if not found, or not sound."""
-        F: FloatArray = np.eye(2)
-        w: FloatArray = np.zeros(self.reduction.size)
+        guess: FloatArray = np.concatenate([np.eye(2).ravel(), np.zeros(self.reduction.size)])
         if near is not None:
-            F = near.gradient + (load - near.load) * near.gradient_rate
-            w = near.fluctuation + (load - near.load) * near.fluctuation_rate
-        found = self.corrected(loading, load, F, w)
+            guess = near.value + (load - near.load) * near.rate
+        found = self.corrected(loading, load, guess)
         return found if isinstance(found, CellState) else None
 
     def corrected(
         self,
         loading: MacroLoading,
         load: float,
-        gradient: FloatArray,
-        fluctuation: FloatArray,
+        guess: FloatArray,
         amplitude: Amplitude | None = None,
     ) -> CellState | str:
-        """The equilibrium near a guess of F̄ (2, 2), w and, with an amplitude, the load.
+        """The equilibrium near a guess (4 + 2 count,) of F̄, w and, with an amplitude, the load.
 
         Where there is none, the reason.
         """
-        F: FloatArray = loading.axes.T @ gradient.ravel()
-        w = fluctuation
+        F: FloatArray = loading.axes.T @ guess[:4]
+        w = guess[4:]
         for _ in range(_ITERATIONS):
             F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
             system = LinearisedCell(self, loading, load, F, w, amplitude)
@@ -284,6 +286,20 @@ class PeriodicCell:
         moduli = (Q.T @ state.moduli.reshape(4, 4) @ Q)[np.ix_(free, free)]
         outer = np.linalg.eigvalsh(0.5 * (moduli + moduli.T))
         return self.factor(state.stiffness).negative_pivots + int(np.sum(outer < 0))
+
+    def critical_distances(
+        self, state: CellState, shapes: FloatArray, eigenvalues: FloatArray
+    ) -> FloatArray:
+        """(k,) how far modes' own critical loads are from a load, over it, to first order [-].
+
+        By the rates at which their Rayleigh quotients fall along the path at ``state``, just
+        before; ``shapes`` (k, n, 2), mean square 1, and ``eigenvalues`` (k,) are at the load.
+        """
+        fields = shapes.reshape(len(shapes), -1).T
+        back = state.value - _BACK * state.load * state.rate
+        before = self.body.stiffness(self.displaced(back[:4], back[4:]))
+        change = np.sum(fields * ((before - state.stiffness) @ fields), axis=0)
+        return np.asarray(eigenvalues * _BACK * self.filling * self.cell.area / change)
 
     def factor(self, stiffness: csr_array) -> Factor:
         """Factorise the stiffness (2 n, 2 n) of the free fluctuations; the same object again.
