@@ -15,13 +15,16 @@ docs/homogenization.md, as Markdown:
   strips and specimens.
 - ``flower``: three modes of triangular stacking under equibiaxial load, computed, analytic and
   measured in an image: all branches by energy, against those of the periodic cell.
-- ``loads``: sides, shear and bending: against Bloch waves, and a specimen bent as it is compressed
-  against its direct simulation.
+- ``loads``: sides, shear and bending: against Bloch waves, and a specimen bent or sheared as it is
+  compressed against its direct simulation.
+- ``independence``: a strip of six cells with other macroscopic elements, points and RVE's elements.
 - ``triangular``: a specimen of triangular stacking, direct and homogenized.
 - ``cost``: seconds and memory a linearisation and RVE, from 60 to 10 000 RVEs.
+- ``ranks``: seconds of the 6 x 10 specimen, for ``mpirun -n N`` before ``python``.
 
 What isn't said otherwise has square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material,
-elements of 0.2 mm. All sections together take about half an hour.
+elements of 0.2 mm. All sections but ``ranks``, which are what is run by default, take about
+an hour.
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -62,7 +66,7 @@ from modeharvest.fem.lattice.options import (
     uniaxial_strain,
 )
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.fem.meshing import SIGNS, MeshBlock, join, quarter_cell
+from modeharvest.fem.meshing import SIGNS, MeshBlock, join, mesh_specimen, quarter_cell
 from modeharvest.fem.path.bifurcation import follow_branch, locate_critical
 from modeharvest.fem.path.continuation import PathFollower
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
@@ -98,13 +102,13 @@ def head(*cells: str) -> None:
     print("|" + "---|" * len(cells))
 
 
-def supercell() -> UnitCell:
-    return square(PITCH, DIAMETER, SIZE).enlarged(2, 2)
+def supercell(size: float = SIZE) -> UnitCell:
+    return square(PITCH, DIAMETER, size).enlarged(2, 2)
 
 
 @cache
-def analytic(centre: tuple[float, float] = JUNCTION) -> RVE:
-    return RVE(supercell(), MATERIAL, [PATTERN], centre)
+def analytic(centre: tuple[float, float] = JUNCTION, size: float = SIZE) -> RVE:
+    return RVE(supercell(size), MATERIAL, [PATTERN], centre)
 
 
 def centred(n: int) -> list[RVE]:
@@ -147,12 +151,12 @@ def cell() -> None:
         row("", "stress at 10 % [MPa]", f"{P:.8f}", f"{exact:.8f}", f"{P / exact - 1:.1e}")
 
 
-def strip_mesh(cells: int, is_cut: bool) -> Mesh:
+def strip_mesh(cells: int, is_cut: bool, size: float) -> Mesh:
     """From the centres of one row of holes to those of the next, where u_y = 0 by symmetry.
 
     Plates touch the lattice between holes or, ``is_cut``, cut through them.
     """
-    quarter, half = quarter_cell(PITCH, DIAMETER, SIZE), 0.5 * cells * PITCH
+    quarter, half = quarter_cell(PITCH, DIAMETER, size), 0.5 * cells * PITCH
     columns = (
         np.arange(cells + 1) * PITCH - half
         if is_cut
@@ -167,9 +171,9 @@ def strip_mesh(cells: int, is_cut: bool) -> Mesh:
     return join(blocks, 1e-7 * PITCH)
 
 
-def direct_strip(cells: int, is_cut: bool) -> tuple[float, list[float]]:
+def direct_strip(cells: int, is_cut: bool, size: float = SIZE) -> tuple[float, list[float]]:
     """Critical strain and nominal stresses at 8 and 10 % [MPa] of a strip."""
-    mesh, length = strip_mesh(cells, is_cut), cells * PITCH
+    mesh, length = strip_mesh(cells, is_cut, size), cells * PITCH
     edge = mesh.nodes[np.abs(np.abs(mesh.nodes[:, 1]) - 0.5 * PITCH) < 1e-6]
     pins = tuple((float(x), float(y)) for x, y in edge)
     structure = Structure(mesh, MATERIAL, EdgeCompression(0.5 * length, length, pins=pins))
@@ -182,10 +186,12 @@ def direct_strip(cells: int, is_cut: bool) -> tuple[float, list[float]]:
     return critical.strain, [structure.reaction(s.u, length) / PITCH for s in states]
 
 
-def homogenized_strip(cells: int, rve: RVE | list[RVE]) -> tuple[float, list[float]]:
-    specimen = Specimen(cells, 2, bulk_x=0, bulk_y=0)
+def homogenized_strip(
+    cells: int, rve: RVE | list[RVE], parts: int | None = None, points: int = 2
+) -> tuple[float, list[float]]:
+    specimen, divisions = Specimen(cells, 2, bulk_x=0, bulk_y=0), (parts or cells, 1)
     body = HomogenizedBody.of_specimen(
-        specimen, rve, PlateLoading(sides="periodic"), divisions=(cells, 1)
+        specimen, rve, PlateLoading(sides="periodic"), divisions=divisions, points=points
     )
     found = homogenize(body, [0.08, 0.1])
     critical = found.critical.load if found.critical else np.nan
@@ -499,36 +505,137 @@ def loads() -> None:
     row("6 x 4 cells", f"{energy:.6e}", f"{exact:.6e}", f"{energy / exact - 1:.1e}")
 
     strains = (0.03, 0.05, 0.06, 0.07, 0.08)
-    head(
-        "6 x 10, one plate turned by 1 rad a unit of strain", "RVEs", "ε_c",
-        *(f"energy, force at {e:.0%}" for e in strains), "negative eigenvalues", "s",
-    )  # fmt: skip
     start = time.perf_counter()
     direct = simulate(Experiment(Specimen(), strains=strains, tilt=1.0))
-    states = [direct.at(e) for e in strains]
-    seconds = time.perf_counter() - start
-    row(
-        "direct", "", "", *(f"{s.energy:.5f} N, {s.reaction:.5f} N/mm" for s in states),
-        ", ".join(str(s.negative_pivots) for s in states), f"{seconds:.0f}",
-    )  # fmt: skip
+    exact_states = states_of(direct, strains)
+    title = "6 x 10, one plate turned by 1 rad a unit of strain"
+    direct_row(title, strains, exact_states, time.perf_counter() - start)
     for parts in ((3, 5), (6, 10)):
         body = HomogenizedBody.of_specimen(Specimen(), analytic(), PlateLoading(), divisions=parts)
-        shortening = tilted(body, 1.0)
-        start = time.perf_counter()
-        found = homogenize(body, strains)
-        seconds = time.perf_counter() - start
-        forces = [
-            LinearisedBody(body, s.load, s.value).forces @ shortening / body.length
-            for s in found.states
-        ]
-        critical = found.critical.load if found.critical else np.nan
-        values = [
-            f"{h.energy / s.energy - 1:+.2%}, {force / s.reaction - 1:+.2%}"
-            for h, force, s in zip(found.states, forces, states, strict=False)
-        ]
-        unstable = ", ".join(str(h.negative_eigenvalues) for h in found.states)
-        values += [""] * (len(states) - len(values))
-        row("homogenized", body.point_count, f"{critical:.3%}", *values, unstable, f"{seconds:.0f}")
+        homogenized_row("homogenized", body, strains, exact_states, shortening=tilted(body, 1.0))
+    sheared()
+
+
+DirectState = tuple[float, float, int]
+"""Energy [N], force [N/mm], negative eigenvalues."""
+
+
+def states_of(direct: Solution, strains: Sequence[float]) -> list[DirectState]:
+    return [(s.energy, s.reaction, s.negative_pivots) for s in map(direct.at, strains)]
+
+
+def direct_row(
+    title: str, strains: Sequence[float], states: Sequence[DirectState], seconds: float,
+    critical: float | None = None,
+) -> None:  # fmt: skip
+    """The head of a table, too."""
+    at = (f"energy, force at {e:.0%}" for e in strains)
+    head(title, "RVEs", "ε_c", *at, "negative eigenvalues", "s")
+    values = (f"{energy:.5f} N, {force:.5f} N/mm" for energy, force, _ in states)
+    unstable = ", ".join(str(negative) for _, _, negative in states)
+    row("direct", "", f"{critical:.3%}" if critical else "", *values, unstable, f"{seconds:.0f}")
+
+
+def homogenized_row(
+    name: str, body: HomogenizedBody, strains: Sequence[float], exact: Sequence[DirectState],
+    critical: float | None = None, shortening: FloatArray | None = None,
+) -> None:  # fmt: skip
+    """``shortening``: the rates of all unknowns that the direct simulation's force works on."""
+    start, values = time.perf_counter(), list[str]()
+    found = homogenize(body, strains)
+    seconds = time.perf_counter() - start
+    for h, (energy, force, _) in zip(found.states, exact, strict=False):
+        ours = h.force
+        if shortening is not None:
+            ours = LinearisedBody(body, h.load, h.value).forces @ shortening / body.length
+        values.append(f"{h.energy / energy - 1:+.2%}, {ours / force - 1:+.2%}")
+    values += [""] * (len(exact) - len(values))
+    e = f"{found.critical.load:.3%}" if found.critical else "none"
+    if critical and found.critical:
+        e += f" ({found.critical.load / critical - 1:+.1%})"
+    unstable = ", ".join(str(h.negative_eigenvalues) for h in found.states)
+    row(name, body.point_count, e, *values, unstable, f"{seconds:.0f}")
+
+
+SHEAR = 0.5
+"""Of plates, a unit of compression [-]."""
+
+
+class ShearedStructure(Structure):
+    """Plates that move across, too, as ``PlateLoading(shear=SHEAR)`` has them."""
+
+    def _constrain(self, loading: EdgeCompression) -> None:
+        super()._constrain(loading)
+        x = self.V.tabulate_dof_coordinates()[:, 0]
+        on_plates = np.abs(np.abs(x) - loading.half_width) < 1e-8 * loading.half_width
+        across = self._direction.x.array.reshape(-1, 2)[:, 1]
+        across[on_plates] = 0.5 * SHEAR * loading.length * np.sign(x[on_plates])
+        self._shortening = self._direction.x.array.copy()  # so that a reaction is dE/de
+
+
+def sheared() -> None:
+    strains, specimen, small = (0.04, 0.08, 0.1, 0.12), Specimen(), PathOptions(0.01, 0.01)
+    start = time.perf_counter()
+    compression = EdgeCompression(specimen.half_size[0], specimen.length)
+    structure = ShearedStructure(mesh_specimen(specimen, SIZE), MATERIAL, compression)
+    follower = PathFollower(structure, small)
+    path = [follower.start()]
+    follower.follow_primary(path, strains, refuse_unstable=True)
+    exact = [
+        (structure.energy(s.u), structure.reaction(s.u, specimen.length), s.negative_pivots)
+        for s in path
+        if np.abs(np.array(strains) - s.strain).min() < 1e-12
+    ]
+    title = f"6 x 10, compressed and sheared by {SHEAR:g} of that"
+    direct_row(title, strains, exact, time.perf_counter() - start)
+    for parts in ((3, 5), (6, 10)):
+        loading = PlateLoading(shear=SHEAR)
+        body = HomogenizedBody.of_specimen(specimen, analytic(), loading, divisions=parts)
+        homogenized_row("homogenized", body, strains, exact)
+
+
+def independence() -> None:
+    head(
+        "strip of six cells", "RVEs", "elements of the lattice [mm]", "ε_c [%]", "change",
+        "stress at 8, 10 % [MPa]", "change",
+    )  # fmt: skip
+    reference: list[FloatArray] = []
+
+    def case(name: str, rves: object, size: float, found: tuple[float, list[float]]) -> None:
+        values = np.array([found[0], *found[1]])
+        reference[:] = reference or [values]
+        off = values / reference[0] - 1
+        row(name, rves, size, f"{100 * values[0]:.4f}", f"{off[0]:+.3%}",
+            ", ".join(f"{s:.5f}" for s in values[1:]),
+            ", ".join(f"{x:+.3%}" for x in off[1:]))  # fmt: skip
+
+    for name, parts, points, size in (
+        ("homogenized", 6, 2, SIZE), ("half as many elements", 3, 2, SIZE),
+        ("twice as many", 12, 2, SIZE), ("four times as many", 24, 2, SIZE),
+        ("3 x 3 points", 6, 3, SIZE), ("finer RVE", 6, 2, 0.5 * SIZE),
+    ):  # fmt: skip
+        found = homogenized_strip(6, analytic(JUNCTION, size), parts, points)
+        case(name, parts * points**2, size, found)
+    reference.clear()
+    for name, size in (("direct, mean of both positions", SIZE), ("finer", 0.5 * SIZE)):
+        both = [direct_strip(6, is_cut, size) for is_cut in (False, True)]
+        stress = np.mean([s for _, s in both], axis=0).tolist()
+        case(name, "", size, (float(np.mean([e for e, _ in both])), stress))
+
+
+def ranks() -> None:
+    world = MPI.COMM_WORLD
+    start, used = time.perf_counter(), time.process_time()
+    found, body, _ = homogenized_specimen(analytic(), (6, 10), (6, 10), (0.128,), quarter=True)
+    spent = world.gather((time.perf_counter() - start, time.process_time() - used))
+    if spent is not None:
+        assert found.critical is not None
+        head("ranks", "RVEs", "ε_c", "force at 12.8% [N/mm]", "seconds", "of each rank's core")
+        row(
+            world.size, body.point_count, f"{found.critical.load:.4%}",
+            f"{found.states[-1].force:.5f}", f"{max(s for s, _ in spent):.1f}",
+            ", ".join(f"{s:.1f}" for _, s in spent),
+        )  # fmt: skip
 
 
 def tilted(body: HomogenizedBody, tilt: float) -> FloatArray:
@@ -543,16 +650,8 @@ def triangular() -> None:
     strains, specimen = (0.06, 0.08, 0.1), Specimen(8, 17, 1.68, stacking="triangular")
     start = time.perf_counter()
     direct = simulate(Experiment(specimen, strains=strains, mesh_size=0.3))
-    states = [direct.at(e) for e in strains]
-    seconds, exact = time.perf_counter() - start, direct.info["critical"]["strain"]
-    head(
-        "8 x 17, triangular", "RVEs", "ε_c",
-        *(f"energy, force at {e:.0%}" for e in strains), "negative eigenvalues", "s",
-    )  # fmt: skip
-    row(
-        "direct", "", f"{exact:.3%}", *(f"{s.energy:.5f} N, {s.reaction:.5f} N/mm" for s in states),
-        ", ".join(str(s.negative_pivots) for s in states), f"{seconds:.0f}",
-    )  # fmt: skip
+    states, critical = states_of(direct, strains), direct.info["critical"]["strain"]
+    direct_row("8 x 17, triangular", strains, states, time.perf_counter() - start, critical)
     four = hexagonal(specimen.pitch, specimen.diameter, 0.3).enlarged(2, 2)
     waves = [
         LatticeMode.of(m, m.family.start, specimen, four.lattice).snapped
@@ -561,18 +660,7 @@ def triangular() -> None:
     for name, modes in (("φ₁, φ₂, φ₃", waves), ("φ₁, φ₃", waves[::2]), ("first order", [])):
         rve = RVE(four, MATERIAL, modes, HOLE)
         body = HomogenizedBody.of_specimen(specimen, rve, PlateLoading(), divisions=(4, 8))
-        start = time.perf_counter()
-        found = homogenize(body, strains)
-        seconds = time.perf_counter() - start
-        critical = found.critical.load if found.critical else np.nan
-        values = [
-            f"{h.energy / s.energy - 1:+.2%}, {h.force / s.reaction - 1:+.2%}"
-            for h, s in zip(found.states, states, strict=False)
-        ]
-        values += [""] * (len(states) - len(values))
-        unstable = ", ".join(str(h.negative_eigenvalues) for h in found.states)
-        ratio = f"{critical:.3%} ({critical / exact - 1:+.1%})"
-        row(name, body.point_count, ratio, *values, unstable, f"{seconds:.0f}")
+        homogenized_row(name, body, strains, states, critical)
 
 
 def cost() -> None:
@@ -606,8 +694,8 @@ PICTURE: list[Path] = []
 """Where to draw the size effect, if anywhere."""
 SECTIONS: dict[str, Callable[[], None]] = {
     "cell": cell, "strips": strips, "specimen": specimen, "choices": choices,
-    "positions": positions, "flower": flower, "loads": loads, "triangular": triangular,
-    "cost": cost,
+    "positions": positions, "flower": flower, "loads": loads, "independence": independence,
+    "triangular": triangular, "cost": cost, "ranks": ranks,
 }  # fmt: skip
 
 
@@ -619,7 +707,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="where to draw the size effect (PNG)")
     options = parser.parse_args()
     PICTURE[:] = [options.picture] if options.picture else []
-    for name in options.section or SECTIONS:
+    for name in options.section or [name for name in SECTIONS if name != "ranks"]:
         SECTIONS[name]()
 
 
