@@ -147,8 +147,8 @@ def test_branches_of_several_modes_that_a_mesh_splits_say_what_to_do() -> None:
     assert single.states[0].energy < single.states[0].primary_energy
     flower = follow(copies, modes, (1, 1, 1), loads)
     assert flower.states == ()
-    said = r"the mesh splits these modes by 0\.\d+ of the load.*mesh one sector of the cell"
-    assert re.search(said, flower.outcome)
+    reason = r"the mesh splits these modes by 0\.\d+ of the load.*mesh one sector of the cell"
+    assert re.search(reason, flower.outcome)
 
 
 def test_the_bound_is_one_and_a_symmetric_mesh_attains_it() -> None:

@@ -188,11 +188,8 @@ class RVE:
         """Modes of mean 0 with their scales."""
         largest = np.linalg.norm(fields, axis=2).max(axis=1, initial=0.0)
         fields = fields - self._mean(fields)
-        flat, material = (
-            fields.reshape(len(fields), self._mass.shape[0]),
-            0.5 * float(self._mass.sum()),
-        )
-        gram = flat @ (self._mass @ flat.T) / material
+        flat = fields.reshape(len(fields), self._mass.shape[0])
+        gram = flat @ (self._mass @ flat.T) / (0.5 * float(self._mass.sum()))
         rms = np.sqrt(np.diag(gram))
         if not (rms > _DEPENDENT * largest).all():
             where = int(np.argmin(rms > _DEPENDENT * largest)) + 1

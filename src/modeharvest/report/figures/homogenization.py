@@ -77,7 +77,11 @@ def draw_amplitude(
 
     ``displacement``: (n, 2) [mm].
     """
-    drawn, axes = _deformed_axes(mesh, displacement)
+    at = mesh.nodes + displacement
+    margin = 0.012 * float(np.ptp(at, axis=0).max())
+    low, high = at.min(axis=0) - margin, at.max(axis=0) + margin
+    drawn, axes = bare_axes(_WIDTH, high - low, 0.78, _ROOM, _ROOM)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     has = np.isfinite(values[mesh.cells]).all(axis=1)
     points, triangles, N = _refined(mesh, mesh.cells[has], displacement)
     shown = np.einsum("pk,ck->cp", N, values[mesh.cells[has]]).ravel()
@@ -99,16 +103,6 @@ def draw_microstructure(rve: Mesh, displacement: FloatArray) -> Figure:
     draw_path(axes, boundary.path(), fill=False, ec=MUTED, lw=0.5, ls=":", clip_on=False)
     draw_path(axes, boundary.path(displacement), fc=BLUE, ec=EDGE, lw=0.5, alpha=0.6, clip_on=False)
     return drawn
-
-
-def _deformed_axes(mesh: Mesh, displacement: FloatArray) -> tuple[Figure, Axes]:
-    """Bare axes around a deformed mesh."""
-    at = mesh.nodes + displacement
-    margin = 0.012 * float(np.ptp(at, axis=0).max())
-    low, high = at.min(axis=0) - margin, at.max(axis=0) + margin
-    drawn, axes = bare_axes(_WIDTH, high - low, 0.78, _ROOM, _ROOM)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    return drawn, axes
 
 
 def _refined(

@@ -167,7 +167,7 @@ def not_reached(response: Mapping[str, Any], count: int) -> list[str]:
 def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) -> dict[str, Any]:
     """The content of ``summary.json``."""
     found, response = data.found, data.found["response"]
-    modes = data.modes
+    modes, known = data.modes, data.parameters
     return {
         "title": title,
         "case": dict(case),
@@ -184,7 +184,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
             "kind": case["mode"]["kind"],
             "wave_change": [change for mode in modes for change in mode.wave_change],
             "waves": [mode.snapped for mode in modes],
-            "errors": _errors(data.parameters),
+            "errors": known and ("noise" if known.by_model_error is None else "model error"),
         }) if modes else None,
         "sensitivities": found["effects"],
         **_compared(data),
@@ -203,13 +203,6 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
         },
         "versions": versions(),
     }  # fmt: skip
-
-
-def _errors(parameters: ModeParameters | None) -> str | None:
-    """What the standard deviations of states count."""
-    if parameters is None:
-        return None
-    return "noise" if parameters.by_model_error is None else "model error"
 
 
 def _compared(data: HomogenizationData) -> dict[str, dict[str, float] | None]:
