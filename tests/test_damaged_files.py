@@ -55,12 +55,13 @@ from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.imaging.photographs.photograph import read_photograph
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.case import Case, case_text
+from modeharvest.runs.homogenization.case import HomogenizationCase
 from modeharvest.runs.lattice.case import LatticeCase
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import PreparedPhotographs
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import reading
+from modeharvest.util.files import open_hdf5, reading
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth, Declared, read_measured
 from modeharvest.validation.scoring.star import Star, StarSet, StarSpec, make_star_set
 
@@ -103,6 +104,7 @@ def _cases(folder: Path) -> dict[str, Readable]:
         "twin": Readable(root / "cases" / "paper-real-twin.toml", Case.read),
         "lattice": Readable(root / "cases" / "square-lattice.toml", LatticeCase.read),
         "study": Readable(root / "cases" / "studies" / "noise.toml", StudyCase.read),
+        "homogenized": Readable(root / "cases" / "paper-homogenized.toml", HomogenizationCase.read),
         "experiment": Readable(harvest, PhotographCase.read),
     }
 
@@ -377,7 +379,7 @@ NAMES = (
     "lens", "images", "truth", "benchmark", "star", "vtu", "vtk", "msh", "inp", "xdmf", "med",
     "vtu field", "field.csv", "field.npz", "packed.npz", "field.h5", "field.mat", "packed.mat",
     "lens.yml", "lens.xml", "dice.xml", "plain.tif", "packed.tif", "grey.png", "grey.bmp",
-    "grey.jpg", "colour.png", "prepared",
+    "grey.jpg", "colour.png", "prepared", "homogenized",
 )  # fmt: skip
 
 
@@ -507,6 +509,18 @@ def test_hdf5_that_reads_other_files_is_refused(
             file[role] = np.arange(4.0)
     with pytest.raises(InputError, match=r"expected all data in the file itself, got 'x'"):
         read_field(tmp_path / name, GRID, units="px", y_axis="down")
+
+
+def test_hdf5_whose_texts_have_no_end_is_refused(tmp_path: Path) -> None:
+    """libhdf5 1.14 looks for them for ever."""
+    path = tmp_path / "labels.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["labels"] = ["X", "M"]
+    whole = path.read_bytes()
+    first = whole.index(b"GCOL") + 16
+    path.write_bytes(whole[:first] + bytes(32) + whole[first + 32 :])
+    with pytest.raises(InputError, match="expected texts that end"), open_hdf5(path, "labels"):
+        pass
 
 
 def test_hdf5_of_a_few_bytes_declares_no_terabyte(tmp_path: Path) -> None:

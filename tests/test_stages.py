@@ -320,6 +320,8 @@ def occupied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         "bloch square-lattice",
         "modes square-lattice",
         "harvest experiment.toml",
+        "measure a.tif b.tif",
+        "homogenize paper-homogenized",
         "study robustness",
         "benchmark make case.toml",
         "benchmark star --rows 51 --cols 400",
@@ -338,7 +340,7 @@ def test_every_command_that_writes_a_folder_has_it_alone(
     Path("case.toml").write_text(synthetic_benchmark.CASE, "utf-8")
     synthetic_benchmark.solution().write("solution.h5")
     for name in ("a.tif", "b.tif"):
-        Path(name).touch()
+        Path(name).write_text("not read before the folder is known to be free")
     Path("experiment.toml").write_text(
         '[images]\nreference = "a.tif"\ndeformed = ["b.tif"]\n'
         "[scale]\npixel_size = 0.01\n[specimen]\ncell_size = 1.9\n"

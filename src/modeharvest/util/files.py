@@ -35,6 +35,7 @@ from modeharvest.util.machine import require_memory
 
 _CHILD_SECONDS, _CHILD_SECONDS_PER_BYTE = 60.0, 1e-5
 """After which a file is taken for one that makes its parser run for ever."""
+_LARGEST_SEARCHED = 1e8  # bytes
 
 
 @contextmanager
@@ -88,11 +89,32 @@ def open_hdf5(
     holds more than there is memory for: a file of a few hundred bytes can hand out any other one,
     and declare any size.
     """
-    with reading(path, what, remedy) as path, h5py.File(path, "r") as file:
-        if form is not None and (got := file.attrs.get("format")) != form:
-            raise InputError(f"expected a {form} file at {path}, got format {got!r}; {remedy}")
-        _require_self_contained(file, path)
-        yield file
+    with reading(path, what, remedy) as path:
+        _require_sound_heaps(path)
+        with h5py.File(path, "r") as file:
+            if form is not None and (got := file.attrs.get("format")) != form:
+                raise InputError(f"expected a {form} file at {path}, got format {got!r}; {remedy}")
+            _require_self_contained(file, path)
+            yield file
+
+
+def _require_sound_heaps(path: Path) -> None:
+    """Refuse a file in which libhdf5 1.14 would look for a text for ever.
+
+    It goes through a global heap by its objects' sizes, of which one is 0 in a damaged file. The
+    largest files aren't searched: runs leave them, and know their digests.
+    """
+    content = path.read_bytes() if path.stat().st_size < _LARGEST_SEARCHED else b""
+    at = -1
+    while (at := content.find(b"GCOL\x01\0\0\0", at + 1)) >= 0:
+        size = int.from_bytes(content[at + 8 : at + 16], "little")
+        place, end = at + 16, min(at + size, len(content))
+        while place + 16 <= end:
+            is_object = any(content[place : place + 2])
+            size = int.from_bytes(content[place + 8 : place + 16], "little")
+            if not (is_object or size):
+                raise InputError(f"expected texts that end at byte {place}, got none")
+            place += 16 + -(-size // 8) * 8 if is_object else size
 
 
 def require_plausible(path: Path, declared: float) -> None:
