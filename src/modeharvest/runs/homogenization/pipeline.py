@@ -324,7 +324,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             free = sum(mode.family.size > 0 for mode in modes)
             raise InputError(
                 f"mode: expected a result with {max(numbers) + 1} free mode(s), as "
-                f"{specimen.stacking} stacking has, got {free} of {len(modes)}"
+                f"{specimen.stacking} stacking has, got {free} of {len(modes)}; give the numbers "
+                "of those to use"
             )
         pair = self._pair
         parameters = self._parameters(result, pair)
