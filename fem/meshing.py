@@ -36,11 +36,11 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
     """
     # Where y is scaled so that holes are circles.
     scale, limit = np.array([1.0, specimen.aspect]), specimen.largest_diameter
-    ligament = (limit - specimen.diameters.max()) * scale.min()
+    half = 0.5 * specimen.ligament_width
     reach = 4.0 * (imperfection.position_sd + 0.5 * imperfection.diameter_sd)
-    if reach > 0.5 * ligament:
+    if reach > half:
         raise InputError(
-            f"imperfection: expected 4 (position_sd + diameter_sd / 2) <= {0.5 * ligament:.3g} mm, "
+            f"imperfection: expected 4 (position_sd + diameter_sd / 2) <= {half:.3g} mm, "
             f"half a ligament, got {reach:.3g} mm; make the scatter smaller"
         )
     if imperfection.is_none:

@@ -224,7 +224,9 @@ class _Run:
         self, snapshots: list[Snapshot], limit: float, paths: dict[str, list[State]]
     ) -> str:
         """Whether every strain was met, or which branch lacks which; primary up to ``limit``."""
-        reasons = []
+        size, thin = self.experiment.mesh_size, self.experiment.specimen.ligament_width
+        coarse = f"; {size:g} mm is a coarse mesh_size for ligaments of {thin:.2g} mm"
+        reasons, hint = [], coarse if size > 0.5 * thin else ""
         for branch in BRANCHES:
             have = [s.nominal_strain for s in snapshots if s.branch == branch]
             missing = [
@@ -234,22 +236,19 @@ class _Run:
                 and not _is_among(e, have)
             ]
             if missing:
-                states = paths.get(branch, [])
-                reached = states[-1].strain if states else limit
+                reached = [limit, *(state.strain for state in paths.get(branch, []))][-1]
                 reasons.append(
                     f"{branch} lacks {', '.join(missing)} "
-                    f"(Newton's method did not converge beyond {100 * reached:.4g} % strain)"
+                    f"(Newton's method did not converge beyond {100 * reached:.4g} % strain{hint})"
                 )
         return "incomplete: " + "; ".join(reasons) if reasons else "complete"
 
 
 def _stable_until(path: list[State], critical: Critical | None) -> float:
     """The strain up to which the primary path is known to be stable; infinity if all of it."""
-    if critical is not None:
-        return critical.strain
-    if path[-1].negative_pivots == 0:
-        return np.inf
-    return max(state.strain for state in path if state.negative_pivots == 0)
+    stable = max(state.strain for state in path if state.negative_pivots == 0)
+    reached = stable if path[-1].negative_pivots else np.inf
+    return reached if critical is None else critical.strain
 
 
 def _is_among(strain: float, strains: Sequence[float]) -> bool:

@@ -151,6 +151,11 @@ class Specimen:
         return min(self.pitch, math.hypot(0.5 * self.pitch, row) if self.is_staggered else row)
 
     @property
+    def ligament_width(self) -> float:
+        """Of the thinnest ligament between two holes [mm]."""
+        return float((self.largest_diameter - self.diameters.max()) * min(1.0, self.aspect))
+
+    @property
     def cell_heights(self) -> tuple[float, float]:
         """y of the upper corners of a hole's cell at x = l/2 and at x = 0 [mm].
 

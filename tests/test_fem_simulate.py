@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from typing import Any
 
@@ -220,7 +221,10 @@ def test_strain_out_of_reach_keeps_what_converged_and_says_so() -> None:
         )
     )
     assert solution.info["outcome"].startswith("incomplete: primary lacks 49 %")
-    assert "did not converge beyond" in solution.info["outcome"]
+    assert re.search(
+        r"did not converge beyond [\d.]+ % strain; 0\.5 mm is a coarse mesh_size for ligaments of "
+        r"0\.4 mm\)$", solution.info["outcome"],
+    )  # fmt: skip
     assert solution.at(0.05).negative_pivots == 0
     assert all(s.nominal_strain == 0.05 for s in solution.snapshots if s.branch == "primary")
 
