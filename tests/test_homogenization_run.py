@@ -583,6 +583,9 @@ def test_three_measured_modes_are_snapped_each(tmp_path: Path) -> None:
     for mode in modes:
         there = mode.snapped(points + lattice[0] - 2 * lattice[1])
         np.testing.assert_allclose(there, mode.snapped(points), atol=1e-9)
+    quarter = 0.5 * case.experiment.specimen.pitch  # of a wave: the pattern of another parity
+    with pytest.raises(InputError, match=r"all of them to be odd .* or all even, got odd, even, o"):
+        run._modes_of(off + np.repeat([0.0, quarter, 0.0], [10, 2, 6]))
     off[12:16] += [0.0, 0.0, 0.3, 0.0]
     with pytest.raises(InputError, match=r"phi3: mode: expected wave vectors within 10%"):
         run._modes_of(off)

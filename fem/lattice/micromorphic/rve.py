@@ -237,17 +237,14 @@ def centred_cell(cell: UnitCell, centre: FloatArray) -> tuple[UnitCell, IntArray
     # Ties are settled alike everywhere: those on a side belong to the right and the upper one.
     tilt = 1e-7 * np.linalg.norm(vectors, axis=1).max() * np.array([1.0, 0.7])
     shift = steps[np.argmin(np.linalg.norm(copies + tilt, axis=2), axis=1)]
-    keys = np.concatenate(
-        [old.master[mesh.cells][..., None], old.shift[mesh.cells] + shift[:, None]], axis=2
-    )
+    keys = np.dstack([old.master[mesh.cells], old.shift[mesh.cells] + shift[:, None]])
     unique, cells = np.unique(keys.reshape(-1, 3), axis=0, return_inverse=True)
     first = np.full(old.count, -1)
     first[old.master[::-1]] = np.arange(len(mesh.nodes))[::-1]
     originals = first[unique[:, 0]]
     offset = unique[:, 1:] - old.shift[originals]
     nodes = mesh.nodes[originals] + offset @ vectors - centre
-    moved = UnitCell(Mesh(nodes, cells.reshape(mesh.cells.shape), mesh.element), vectors)
-    return moved, originals
+    return UnitCell(Mesh(nodes, cells.reshape(mesh.cells.shape), mesh.element), vectors), originals
 
 
 def _at_nodes(mode: ModeField, number: int, cell: UnitCell) -> FloatArray:
@@ -255,12 +252,9 @@ def _at_nodes(mode: ModeField, number: int, cell: UnitCell) -> FloatArray:
     nodes = cell.mesh.nodes
     values = np.asarray(mode(nodes) if callable(mode) else mode, dtype=np.float64)
     if values.shape != nodes.shape or not np.isfinite(values).all():
-        raise InputError(
-            f"mode {number}: expected finite values {nodes.shape} at the cell's nodes, got "
-            f"{values.shape}"
-        )
-    count = cell.periodicity.count
-    at_masters = np.zeros((count, 2))
+        what = f"expected finite values {nodes.shape} at the cell's nodes"
+        raise InputError(f"mode {number}: {what}, got {values.shape}")
+    at_masters = np.zeros((cell.periodicity.count, 2))
     at_masters[cell.periodicity.master] = values
     off = np.abs(at_masters[cell.periodicity.master] - values).max()
     largest = float(np.linalg.norm(values, axis=1).max())

@@ -304,6 +304,12 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                 found.append(LatticeMode.of(modes[k], own, specimen, self._cell.lattice))
             except InputError as error:
                 raise InputError(f"phi{k + 1}: {error}") from error
+        # Modes of one stacking are images of each other, a hole's centre fixed.
+        waves, size = [mode.snapped for mode in found], np.linalg.norm
+        parities = ["odd" if size(w.sine) > size(w.cosine) else "even" for w in waves]
+        if len(set(parities)) > 1:
+            what = "modes: expected all of them to be odd about a hole's centre or all even, got"
+            raise InputError(f"{what} {', '.join(parities)}; leave out what is not observable")
         return tuple(found)
 
     def _found_modes(self) -> FoundModes:
