@@ -93,13 +93,14 @@ ROWS = (
     *(Row(s, s) for s in (0.002, 0.005, 0.01, 0.02, 0.04)),
     *(Row(s, 0.0) for s in (0.002, 0.01, 0.04)),
     *(Row(0.0, s) for s in (0.002, 0.01, 0.04)),
-    *(Row(0.01, 0.01, PAPER_PX, degree) for degree in (2, 3, 5)),
+    *(Row(0.01, 0.01, PAPER_PX, degree) for degree in (2, 3, 4, 5)),
     *(
         Row(f * s, g * s, width)
         for width in (3.0, 4.0, 6.0)
         for f, g in ((1, 1), (1, 0), (0, 1))
         for s in (0.002, 0.01, 0.04)
     ),
+    *(Row(0.002, in_g, 3.0, 5) for in_g in (0.002, 0.0)),
     *(Row(s, s, 6.0, degree) for degree in (3, 5) for s in (0.01, 0.04)),
     *(Row(s, s, 8.0) for s in (0.002, 0.01, 0.04)),
     *(Row(s, s, options=LEAST_SQUARES) for s in (0.002, 0.01, 0.04)),
