@@ -273,8 +273,8 @@ class _Measurement:
             M = body.matrix(blocks)
             ratio = body.energies(M) / body.energies(R)
         else:
-            blocks, signal, gain = kept.sums.blocks, kept.signal, kept.gain
-            M, ratio = kept.M, kept.ratio
+            blocks, M, ratio = kept.sums.blocks, kept.M, kept.ratio
+            signal, gain = kept.signal, kept.gain
         gradient = body.vector(gain * signal[:, None, None] * sums.gradient)
         sums = replace(sums, blocks=blocks)
         self.kept = Linearised(
@@ -394,7 +394,8 @@ class _Measurement:
                 "expected images that determine a displacement, got no finite one: too much of "
                 "the mesh, or of the mask, shows no speckle that is in both images; check them"
             )
-        counts = np.diff(self._prepare(FULL).pixels.start)
+        on = self._prepare(FULL)
+        counts = np.diff(on.pixels.start)
         blank = float(counts[at.signal == 0.0].sum() / counts.sum())
         if blank > _BLANK:
             self.warnings += (

@@ -34,8 +34,8 @@ _BLOCK = 64
 """Pixels of an element that are worked on together."""
 _REACH_PX = 4
 """How far beyond the material pixels are continued by polynomials."""
-_SIGMAS_PX = (1.0, 1.5, 2.0)
-"""Of Gaussians that weigh the material's pixels for that, of which the best one is found."""
+_SIGMA_PX = 1.5
+"""Of the Gaussian that weighs the material's pixels for that."""
 _WINDOW_PX = 6
 _RIDGE = 1e-3
 """Against polynomials that too few pixels determine, of the sum of weights."""
@@ -91,21 +91,18 @@ def continued_pixels(pair: ImagePair, noise_f: float, noise_g: float) -> Continu
     g, mask = pair.deformed, pair.deformed_mask
     if mask is None or mask.all():
         return NONE_CONTINUED
-    # The tried pixel has noise itself, and so would have the one that is missing.
-    excess, noise = max(0.0, _best_sigma(g, mask)[0] - 2.0 * noise_g), noise_f + noise_g
-    ratio = min(_LARGEST_VARIANCE, excess / noise) if noise > 0.0 else _LARGEST_VARIANCE
-    return ContinuedPixels((~mask).astype(np.float32), ratio)
-
-
-def _best_sigma(image: FloatImage, mask: BoolArray) -> tuple[float, float]:
-    """Least mean square error of outermost pixels if continued [grey levels^2], and its sigma."""
     inside = ndimage.binary_erosion(mask, border_value=1)
-    outermost, found, tried = mask & ~inside, image.copy(), []
-    of_material, at = (readable(image), readable(inside)), readable(np.argwhere(outermost))
-    for sigma in _SIGMAS_PX if len(at) and inside.any() else ():
-        in_parallel(_continue, *of_material, at, sigma, found)
-        tried.append((float(np.nanmean((found - image)[outermost] ** 2)), sigma))
-    return min(tried, default=(np.inf, _SIGMAS_PX[0]))
+    outermost = mask & ~inside
+    ratio = _LARGEST_VARIANCE
+    if inside.any():
+        found, (rows, cols) = np.empty(g.shape, np.float32), np.nonzero(outermost)
+        of_material = readable(g), readable(inside)
+        in_parallel(_continue, *of_material, readable(rows), readable(cols), found)
+        error = float(np.mean((found[outermost] - g[outermost]) ** 2))
+        # The tried pixel has noise itself, and so would have the one that is missing.
+        excess, noise = max(0.0, error - 2.0 * noise_g), noise_f + noise_g
+        ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
+    return ContinuedPixels((~mask).astype(np.float32), ratio)
 
 
 def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
@@ -117,18 +114,18 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     """
     distance, nearest = ndimage.distance_transform_edt(~mask, return_indices=True)
     filled = np.ascontiguousarray(image[tuple(nearest)])
-    at = readable(np.argwhere((distance > 0) & (distance <= _REACH_PX)))
-    sigma = _best_sigma(image, mask)[1]
-    in_parallel(_continue, readable(image), readable(mask), at, sigma, filled)
+    rows, cols = np.nonzero((distance > 0) & (distance <= _REACH_PX))
+    of_material = readable(image), readable(mask)
+    in_parallel(_continue, *of_material, readable(rows), readable(cols), filled)
     return filled
 
 
 @compiled(relaxed=True)
 def _continue(
-    image: Any, mask: Any, at: Any, sigma: float, out: NDArray[Any], thread: int, threads: int
+    image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any], thread: int, threads: int
 ) -> None:
-    for p in range(thread, at.shape[0], threads):
-        i, j = at[p, 0], at[p, 1]
+    for p in range(thread, rows.size, threads):
+        i, j = rows[p], cols[p]
         A, b, phi = np.zeros((6, 6)), np.zeros(6), np.ones(6)
         for k in range(max(0, i - _WINDOW_PX), min(image.shape[0], i + _WINDOW_PX + 1)):
             for m in range(max(0, j - _WINDOW_PX), min(image.shape[1], j + _WINDOW_PX + 1)):
@@ -136,7 +133,7 @@ def _continue(
                     continue
                 y, x = float(k - i), float(m - j)
                 phi[1], phi[2], phi[3], phi[4], phi[5] = x, y, x * x, x * y, y * y
-                w = np.exp(-0.5 * (x * x + y * y) / sigma**2)
+                w = np.exp(-0.5 * (x * x + y * y) / _SIGMA_PX**2)
                 for a in range(6):
                     b[a] += w * phi[a] * image[k, m]
                     for c in range(6):
@@ -185,8 +182,9 @@ class MeshPixels:
         kept = self._kept.get(key)
         if kept is None or not np.array_equal(kept[0], mask):
             kept = self._kept[key] = mask, self._sorted(grid, mask)
-        row, col = kept[1].row, kept[1].col
-        return kept[1]._replace(grey=np.asarray(image, np.float32)[row, col])
+        pixels = kept[1]
+        grey = np.asarray(image, np.float32)[pixels.row, pixels.col]
+        return pixels._replace(grey=grey)
 
     def _sorted(self, grid: PixelGrid, mask: BoolArray) -> ElementPixels:
         mesh = self.mesh
@@ -296,8 +294,8 @@ def normal_equations(
         valid, *continued_in_g, level.grid.pixel_size, blocks, gradient, sums,
     )  # fmt: skip
     squares, counts, outside, weights = sums.T[:4]
-    lost = int(outside.sum())
-    return NodalEquations(blocks, gradient, squares, counts, weights, sums[:, 4:], lost)
+    lost, slopes = int(outside.sum()), sums[:, 4:]
+    return NodalEquations(blocks, gradient, squares, counts, weights, slopes, lost)
 
 
 @compiled(relaxed=True)

@@ -301,6 +301,7 @@ class Imbalance:
         self._free = csr_array(diags_array(free))
         dofs = (2 * mesh.cells[:, :, None] + np.arange(2)).reshape(len(mesh.cells), 12)
         self._rows, self._cols = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, 12).ravel()
+        self._dofs = dofs.ravel()
 
     def forces(self, u: FloatArray) -> tuple[FloatArray, csr_array]:
         """(2 n,) internal forces at u (2 n,) and their derivatives (2 n, 2 n), up to a factor."""
@@ -314,7 +315,7 @@ class Imbalance:
         f = np.einsum("eqij,eqaj->eai", P, self._slopes, optimize=True)
         half = np.einsum("eqijkl,eqbl->eqijkb", A, self._slopes, optimize=True)
         K = np.einsum("eqijkb,eqaj->eaibk", half, self._slopes, optimize=True)
-        total = nodal_sums(len(self.mesh.nodes), cells, f).ravel()
+        total = np.asarray(np.bincount(self._dofs, f.ravel(), u.size), dtype=np.float64)
         return total, csr_array((K.ravel(), (self._rows, self._cols)), shape=(u.size, u.size))
 
     def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
