@@ -14,7 +14,9 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -65,24 +67,29 @@ def main() -> None:
     given = parser.parse_args()
     print("specimen, pixel [mm], speckle [px], noise: cut-off [px], error; the best; ratio")
     rows = []
-    for name, (specimen, strain) in SPECIMENS.items():
-        solution = simulate(Experiment(specimen, strains=(strain,), mesh_size=0.25))
-        for pixel in given.pixel:
-            for width in given.speckle:
-                speckle = SpeckleSpec(0.05 * 12.0 / width, blur_px=3.0 * width / 12.0)
-                with tempfile.TemporaryDirectory() as folder:
-                    spec = ImagingSpec(pixel_size=pixel, speckle=speckle)
-                    make_images(solution, spec, folder)
-                    images = ImageSet.read(Path(folder))
-                    pairs = {noise: noisy(images, strain, noise, 0) for noise in given.noise}
-                    for noise, pair in pairs.items():
-                        rows.append(found(pair, specimen, name, noise, width))
-                        show(rows[-1])
+    for name, _, width, noise, pair in cases(given.pixel, given.speckle, given.noise):
+        rows.append(found(pair, SPECIMENS[name][0], name, noise, width))
+        show(rows[-1])
     ratios = np.array([row.error / row.best_error for row in rows])
     print(f"{len(rows)} cases: ratio at most {ratios.max():.2f}, median {np.median(ratios):.2f}, "
           f"above 1.25 in {int((ratios > 1.25).sum())}")  # fmt: skip
     if given.json:
         given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), "utf-8")
+
+
+def cases(
+    pixels: Sequence[float], speckles: Sequence[float], noises: Sequence[float]
+) -> Iterator[tuple[str, float, float, float, ImagePair]]:
+    """Specimen, pixel [mm], speckle's width [px] and noise, with the images."""
+    for name, (specimen, strain) in SPECIMENS.items():
+        solution = simulate(Experiment(specimen, strains=(strain,), mesh_size=0.25))
+        for pixel, width in product(pixels, speckles):
+            speckle = SpeckleSpec(0.05 * 12.0 / width, blur_px=3.0 * width / 12.0)
+            with tempfile.TemporaryDirectory() as folder:
+                make_images(solution, ImagingSpec(pixel_size=pixel, speckle=speckle), folder)
+                images = ImageSet.read(Path(folder))
+                for noise in noises:
+                    yield name, pixel, width, noise, noisy(images, strain, noise, 0)
 
 
 def found(pair: ImagePair, specimen: Specimen, name: str, noise: float, width: float) -> Row:

@@ -15,27 +15,20 @@ Run: scripts/env python benchmarks/roughness.py [--power 0.5 1] [--noise 0 0.01 
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
-from cutoff import SPECIMENS
+from cutoff import SPECIMENS, cases
 from scipy import ndimage
 from scipy.sparse import csr_array
-from whole_field import EDGE_PX, noisy
+from whole_field import EDGE_PX
 
-from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.measure import _STAGES, FiniteElementOptions, _Measurement
 from modeharvest.idic.finite_element.system import Body, Smoothness, SmoothnessRoots, interior_sides
-from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.util.arrays import FloatArray
 
 AROUND, CONTRAST = 2, 100.0
@@ -78,32 +71,24 @@ def main() -> None:
     given = parser.parse_args()
     print("specimen, pixel [mm], speckle [px], noise, power (0: as it is): cut-off [px], errors "
           f"({', '.join(NAMES)}) [px], 95 % intervals hold (all, edges), s")  # fmt: skip
-    cases = []
-    for name, (specimen, strain) in SPECIMENS.items():
-        solution = simulate(Experiment(specimen, strains=(strain,), mesh_size=0.25))
-        for pixel in given.pixel:
-            for width in given.speckle:
-                speckle = SpeckleSpec(0.05 * 12.0 / width, blur_px=3.0 * width / 12.0)
-                with tempfile.TemporaryDirectory() as folder:
-                    make_images(solution, ImagingSpec(pixel_size=pixel, speckle=speckle), folder)
-                    images = ImageSet.read(Path(folder))
-                    for noise in given.noise:
-                        pair, case = noisy(images, strain, noise, 0), {}
-                        for power, row in rows(pair, specimen, given.power):
-                            case[power] = row
-                            what = f"{name:22s} {pixel:5.3f} {width:4.0f} {noise:6.3f} {power:4.2f}"
-                            print(what, *(f"{v:8.4g}" for v in row), flush=True)
-                        cases.append(case)
+    found = []
+    for name, pixel, width, noise, pair in cases(given.pixel, given.speckle, given.noise):
+        case = {}
+        for power, row in rows(pair, SPECIMENS[name][0], given.power):
+            case[power] = row
+            what = f"{name:22s} {pixel:5.3f} {width:4.0f} {noise:6.3f} {power:4.2f}"
+            print(what, *(f"{v:8.4g}" for v in row), flush=True)
+        found.append(case)
     for power in given.power:
-        ratios = np.array([case[power] / case[0.0] for case in cases])
+        ratios = np.array([case[power] / case[0.0] for case in found])
         means = np.exp(np.log(ratios).mean(axis=0))
-        covered = np.array([case[power] for case in cases])
-        print(f"power {power:g}, {len(cases)} cases, over those without weights:")
+        covered = np.array([case[power] for case in found])
+        print(f"power {power:g}, {len(found)} cases, over those without weights:")
         for k, what in enumerate(NAMES, 1):
             print(f"  {what:8s} {means[k]:5.2f} ({ratios[:, k].min():.2f} ... "
                   f"{ratios[:, k].max():.2f})")  # fmt: skip
         for k, what in ((5, "all"), (6, "edges")):
-            before = np.array([case[0.0][k] for case in cases])
+            before = np.array([case[0.0][k] for case in found])
             print(f"  intervals hold, {what}: {covered[:, k].mean():.3f} (at least "
                   f"{covered[:, k].min():.3f}); without {before.mean():.3f} "
                   f"({before.min():.3f})")  # fmt: skip
