@@ -171,7 +171,7 @@ class _Run:
         self, path: Sequence[State], limit: float, branches: dict[str, list[State]]
     ) -> list[Snapshot]:
         beyond = np.inf if "primary" in self.experiment.branches else limit
-        met = (s for s in path if _is_among(s.strain, self.experiment.strains))
+        met = (s for s in path if np.isclose(s.strain, self.experiment.strains, 0, 1e-12).any())
         kept = [(state, "primary") for state in met if state.strain <= beyond]
         kept += [(state, name) for name, states in branches.items() for state in states]
         kept.sort(key=lambda item: (item[0].strain, item[0].negative_pivots))
@@ -233,7 +233,7 @@ class _Run:
                 f"{100 * e:g} %"
                 for e in self.experiment.strains
                 if branch in (self.experiment.branches if e > limit else ("primary",))
-                and not _is_among(e, have)
+                and not np.isclose(e, have, 0, 1e-12).any()
             ]
             if missing:
                 reached = [limit, *(state.strain for state in paths.get(branch, []))][-1]
@@ -249,10 +249,6 @@ def _stable_until(path: list[State], critical: Critical | None) -> float:
     stable = max(state.strain for state in path if state.negative_pivots == 0)
     reached = stable if path[-1].negative_pivots else np.inf
     return reached if critical is None else critical.strain
-
-
-def _is_among(strain: float, strains: Sequence[float]) -> bool:
-    return any(abs(strain - e) < 1e-12 for e in strains)
 
 
 _ATTEMPTS = 3  # with shorter and shorter steps

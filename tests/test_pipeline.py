@@ -141,7 +141,7 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
         assert found["rms_bulk_px"] < found["rms_px"] < found["rms_edges_px"] < found["max_px"]
         assert found["rms_refit_to_best_fit_px"] < 0.5 * snapshot["rms_idic_to_best_fit_px"]
         assert found["interval_coverage"] > 0.85
-        assert "seconds" not in found
+        assert found["seconds"] > 0.0
         name = f"displacement_{round(1e4 * snapshot['nominal_strain']):04d}.h5"
         assert read_result(folder / "whole_field" / name).unknowns == found["unknowns"]
     assert [path.name for path in folder.rglob("*timings*")] == ["timings.json"]

@@ -23,7 +23,7 @@ _NORMAL_95 = 1.959964
 class WholeFieldSummary:
     """Errors of the whole displacement, rms per component over the material's pixels.
 
-    Regions are those of scores.
+    Regions are those of scores. Two runs differ in nothing but ``seconds``.
     """
 
     rms_px: float = quantity("whole displacement: truth − measured, rms", "px")
@@ -46,6 +46,8 @@ class WholeFieldSummary:
     library: str
     """That factorised the matrices."""
     warnings: tuple[str, ...]
+    seconds: float | None = None
+    """Of a run's stage that measures all its images, on this machine: differs from run to run."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,8 @@
     stages.json timings.json               which stages are finished, and what they took
 
 A stage whose inputs, options and code have not changed, and whose files are what it wrote, is
-not run again. Two runs of a case leave the same bytes in every file but ``timings.json``.
+not run again. Two runs of a case leave the same bytes in every file but ``timings.json``, and but
+``seconds`` of the whole displacement in ``summary.json``, with its digest.
 """
 
 from __future__ import annotations
@@ -238,7 +239,8 @@ class Run(StagedRun[Case]):
             pictures = draw_figures(experiment_figures(data), self.progress)
             numbers = list(snapshots)
             for k, whole in enumerate(wholes):
-                numbers[k] = replace(numbers[k], whole_field=whole[1])
+                errors = replace(whole[1], seconds=self.timings.get("measure"))
+                numbers[k] = replace(numbers[k], whole_field=errors)
             summary = experiment_summary(measured, case.plain(), numbers).plain()
         write_page(experiment_report(summary, data), page, pictures=pictures)
         return summary

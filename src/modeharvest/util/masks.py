@@ -51,6 +51,6 @@ def connected_to(seed: BoolArray, mask: BoolArray) -> BoolArray:
 
 
 def room_around(mask: BoolArray) -> IntArray:
-    """(rows, cols) distance to what is off the mask or beyond the image, in king's moves [px]."""
+    """(rows, cols) chessboard distance to what is off the mask or beyond the image [px]."""
     distance = distance_transform_cdt(np.pad(mask, 1), "chessboard")
     return np.asarray(distance[1:-1, 1:-1], dtype=np.int64)
