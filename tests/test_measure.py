@@ -271,11 +271,12 @@ def error_from(
     return (found - exact.truth.displacement)[mask] / GRID.pixel_size
 
 
-@pytest.mark.parametrize(
-    ("off_px", "wave_px"), [(4.0, 60.0), (4.0, 40.0), (8.0, 80.0), (20.0, 200.0)]
-)
+@pytest.mark.parametrize(("off_px", "wave_px"), [(4.0, 60.0), (4.0, 40.0), (8.0, 80.0)])
 def test_all_is_found_from_a_start_that_is_far_off(off_px: float, wave_px: float) -> None:
-    """Background taken for material made nodes run away, by 7 px; local minima were kept."""
+    """Background taken for material made nodes run away, by 7 px; local minima were kept.
+
+    From 10 px over 100 px on it is luck: a change of the start by 1e-9 px decides.
+    """
     error = error_from(off_px, wave_px)
     assert np.isfinite(error).all()
     assert np.sqrt(np.mean(error**2)) < 0.06

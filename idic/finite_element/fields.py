@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def stretches(F: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
     The direction is that in the reference, from x towards y, in (-pi/2, pi/2].
     """
-    C = np.einsum("...ki,...kj->...ij", F, F)
+    C = F.swapaxes(-1, -2) @ F
     half, difference = 0.5 * (C[..., 0, 0] + C[..., 1, 1]), 0.5 * (C[..., 0, 0] - C[..., 1, 1])
     larger = np.sqrt(half + np.hypot(difference, C[..., 0, 1]))
     # Not the root of the difference, which cancels.
@@ -62,10 +63,6 @@ def stretches(F: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _direction(F: FloatArray) -> FloatArray:
     angle = stretches(F)[2]
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
-def _green_lagrange(F: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (np.einsum("...ki,...kj->...ij", F, F) - np.eye(2)))
 
 
 def _logarithmic(F: FloatArray) -> FloatArray:
@@ -100,14 +97,10 @@ def _cauchy(material: Material, F: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kij,klj->kil", _first_piola(material, F), F) / J)
 
 
-def _energy_density(material: Material, F: FloatArray) -> FloatArray:
-    return np.asarray(material.energy(JetMatrix(F)).value)
-
-
 _ALL, _SYMMETRIC = "xx xy yx yy", "xx yy xy"
 FIELDS: dict[str, Field] = {
     "F": Field(_ALL, lambda F, _: F),
-    "green_lagrange": Field(_SYMMETRIC, lambda F, _: _green_lagrange(F)),
+    "green_lagrange": Field(_SYMMETRIC, lambda F, _: 0.5 * (F.swapaxes(-1, -2) @ F - np.eye(2))),
     "logarithmic": Field(_SYMMETRIC, lambda F, _: _logarithmic(F)),
     "J": Field("", lambda F, _: determinant(F)),
     "stretch_1": Field("", lambda F, _: stretches(F)[0]),
@@ -115,7 +108,9 @@ FIELDS: dict[str, Field] = {
     "direction_1": Field("x y", lambda F, _: _direction(F)),
     "P": Field(_ALL, _of_material(_first_piola), "MPa", True),
     "cauchy": Field(_SYMMETRIC, _of_material(_cauchy), "MPa", True),
-    "energy_density": Field("", _of_material(_energy_density), "MPa", True),
+    "energy_density": Field(
+        "", _of_material(lambda law, F: np.asarray(law.energy(JetMatrix(F)).value)), "MPa", True
+    ),
 }
 """By their names: F; J = det F; the larger and smaller principal stretch and the larger one's
 direction in the reference; E = (F'F - I)/2; Hencky's ln U, U^2 = F'F; in plane strain the first
@@ -143,12 +138,13 @@ def deviation_of(
             ahead *= np.sign(np.sum(ahead * behind, axis=1, keepdims=True))
         slopes.append((ahead - behind) / (2.0 * _STEP))
     D = np.stack(slopes, axis=-1)
-    return np.asarray(np.sqrt(np.maximum(np.einsum("k...i,kij,k...j->k...", D, covariance, D), 0)))
+    carried = np.einsum("k...i,kij->k...j", D, covariance)
+    return np.asarray(np.sqrt(np.maximum(np.einsum("k...j,k...j->k...", carried, D), 0.0)))
 
 
 def nodal_gradient(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     """(n, c, 2) gradient of nodal fields (n, c), the mean of the elements around each node."""
-    return mean_around(mesh, element_gradients(mesh, nodal)[0])
+    return mean_around(mesh, element_gradients(mesh, nodal))
 
 
 def interpolation_error(mesh: Mesh, nodal: FloatArray) -> FloatArray:
@@ -157,20 +153,26 @@ def interpolation_error(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     The gradients of neighbours differ by that of the error, a wave from node to node, h/2 apart in
     elements of sides h: its rms is h/(4 pi) times that of its gradient.
     """
-    gradients, areas = element_gradients(mesh, nodal)
+    gradients, areas = element_gradients(mesh, nodal), _slopes(mesh)[1]
     off = gradients - mean_around(mesh, gradients)[mesh.cells]
     square = (off**2).sum(axis=-1).mean(axis=1) * (4.0 / np.sqrt(3.0) * areas)[:, None]
     around = mean_around(mesh, np.repeat(square[:, None], mesh.cells.shape[1], axis=1))
     return np.asarray(np.sqrt(around) / (4.0 * np.pi))
 
 
-def element_gradients(mesh: Mesh, nodal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(m, k, c, 2) gradients at the nodes of elements, (m,) areas of these [mm^2]."""
+def element_gradients(mesh: Mesh, nodal: FloatArray) -> FloatArray:
+    """(m, k, c, 2) gradients of nodal fields (n, c) at the nodes of elements."""
+    found = _slopes(mesh)[0] @ nodal[mesh.cells]
+    return found.reshape(*mesh.cells.shape, 2, -1).swapaxes(2, 3)
+
+
+@lru_cache(maxsize=2)
+def _slopes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
+    """(m, 2 k, k) slopes of the shape functions at the nodes, along x and y in turn, (m,) areas."""
     local = shape_gradients(mesh.element, reference_element(mesh.element).nodes)
     F = np.einsum("eki,qkj->eqij", mesh.nodes[mesh.cells], local)
-    slopes = np.einsum("qkj,eqjl->eqkl", local, np.linalg.inv(F))
-    gradients = np.einsum("ekc,eqkl->eqcl", nodal[mesh.cells], slopes, optimize=True)
-    return gradients, 0.5 * np.linalg.det(F).mean(axis=1)
+    slopes = np.einsum("qkj,eqjl->eqlk", local, np.linalg.inv(F))
+    return slopes.reshape(len(F), -1, len(local)), 0.5 * np.linalg.det(F).mean(axis=1)
 
 
 def mean_around(mesh: Mesh, values: FloatArray) -> FloatArray:

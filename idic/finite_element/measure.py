@@ -354,7 +354,7 @@ class _Measurement:
 
     def _deformation_gradient(self) -> FloatArray:
         """(m, 2, 2) F of each element [-]."""
-        gradients, _ = element_gradients(self.body.mesh, self.u.reshape(-1, 2))
+        gradients = element_gradients(self.body.mesh, self.u.reshape(-1, 2))
         return np.asarray(np.eye(2) + gradients.mean(axis=1))
 
     def _noise_in(self, at: Linearised) -> FloatArray:

@@ -13,7 +13,7 @@ the threads and summed in order, so that the result does not depend on how many 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,12 +53,13 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     edge_px : pixels closer than this to the mask's edge are left out on the finest level [px].
     order : of the spline.
     """
-    found, mask = level_pair(pair, level, edge_px, order), pair.masks[1]
     if level != FULL:
-        return found
+        return level_pair(pair, level, edge_px, order)
+    inside, mask = pair.masks
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
     g = continued_spline(pair.deformed, mask, order)
-    return replace(found, deformed=g, valid=None if valid.all() else valid)
+    inside = eroded(inside, edge_px)
+    return LevelPair(pair.grid, pair.reference, g, inside, None if valid.all() else valid)
 
 
 def continued_spline(image: FloatImage, mask: BoolArray, order: int) -> SplineImage:
@@ -403,9 +404,10 @@ def _weigh(n: int, outside: Any, variance: float, own: Any) -> None:
             above = (1.0 - b) * outside[i, j] + b * outside[i, j + 1]
             below = (1.0 - b) * outside[i + 1, j] + b * outside[i + 1, j + 1]
             part = (1.0 - a) * above + a * below
-            own[3, m] = 1.0 / (1.0 + variance * part * part)
-            for k in range(3):
-                own[k, m] *= np.sqrt(own[3, m])
+            if part > 0.0:
+                own[3, m] = 1.0 / (1.0 + variance * part * part)
+                for k in range(3):
+                    own[k, m] *= np.sqrt(own[3, m])
 
 
 @compiled(relaxed=True)

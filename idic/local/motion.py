@@ -121,14 +121,10 @@ def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tupl
         plane = edge_motion(pair.mask, pair.deformed_mask, pair.grid)
     if plane is None:
         return (np.zeros_like, "v0 starts from no motion: neither holes nor boundaries are known.")
-    return partial(_affine, plane), (
+    return lambda points: plane[:, 0] + points @ plane[:, 1:].T, (
         f"v0 starts from the boundaries: {100 * plane[0, 1]:+.1f} % along x and "
         f"{100 * plane[1, 2]:+.1f} % along y."
     )
-
-
-def _affine(plane: FloatArray, points: FloatArray) -> FloatArray:
-    return plane[:, 0] + points @ plane[:, 1:].T
 
 
 def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:

@@ -263,7 +263,11 @@ def draw_energies(
 
     ``branches``: those with states. ``critical``: critical load [-].
     """
-    return _branches(branches, critical, load, "energy − primary path's [kPa]", _excess, zero=True)
+
+    def above(branch: Branch) -> list[float]:
+        return [1e3 * (s.energy - s.primary_energy) for s in branch.states]
+
+    return _branches(branches, critical, load, "energy − primary path's [kPa]", above, zero=True)
 
 
 def draw_amplitudes(
@@ -291,10 +295,6 @@ def draw_differences(branches: Sequence[Branch], load: LoadQuantity = STRAIN) ->
         return [1e6 * (s.energy - lowest[s.load]) for s in branch.states]
 
     return _branches(branches, None, load, "energy − lowest branch's [Pa]", above, zero=True)
-
-
-def _excess(branch: Branch) -> list[float]:
-    return [1e3 * (s.energy - s.primary_energy) for s in branch.states]
 
 
 def _size(branch: Branch) -> list[float]:
