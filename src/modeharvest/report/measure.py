@@ -94,11 +94,11 @@ def _cards(
     def nodal(values: FloatArray, what: str, signed: bool = True) -> Figure:
         field = result.on_pixels(values[:, None], frame.grid)[..., 0]
         scale = ColourScale.signed if signed else ColourScale.size
-        return draw_field(frame, field, scale(field, what, 0.999), unit=unit)
+        return draw_field(frame, field, scale(field, what, 0.99), unit=unit)
 
     def left() -> Figure:
-        field = frame.average(residual(name, result))
-        return draw_field(frame, field, ColourScale.signed(field, "levels", 0.999), unit=unit)
+        field = frame.average(residual(name, result))  # pixels on edges show the background
+        return draw_field(frame, field, ColourScale.signed(field, "levels", 0.95), unit=unit)
 
     u, strain = result.displacement, result.field("logarithmic")
     sd = np.linalg.norm(result.standard_deviation, axis=1)
