@@ -30,14 +30,9 @@ from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import Images, ImageScale, PhotographCase
 from modeharvest.runs.photographs.prepare import Optics
-from modeharvest.runs.photographs.results import (
-    FrameTruth,
-    Harvest,
-    HarvestedFrame,
-    HarvestTruth,
-    TruthCheck,
-)
+from modeharvest.runs.photographs.results import FrameTruth, Harvest, HarvestedFrame, HarvestTruth
 from modeharvest.validation.onset import ImageAmplitude, find_buckling
+from modeharvest.validation.summary import Expectation
 
 FloatArray = NDArray[np.float64]
 
@@ -177,8 +172,8 @@ def harvest(
         for one in frames
     }
     rows = (
-        TruthCheck("largest v₁ against the best fit", 1.2, "within 3", True, "%"),
-        TruthCheck("distortion, affine part aside", 0.07, 0.05, False, "px"),
+        Expectation("largest v₁ against the best fit", 1.2, "within 3", True, "%"),
+        Expectation("distortion, affine part aside", 0.07, 0.05, False, "px"),
     )
     case = PhotographCase(
         title="Made up <for tests>",

@@ -38,13 +38,14 @@ from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
-from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth, TruthCheck
+from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, copy_whole, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, Stages, exclusive, stage_key
 from modeharvest.util.typed import to_plain
+from modeharvest.validation.summary import Expectation
 from modeharvest.validation.truth import rms
 from modeharvest.validation.whole_field import (
     WholeFieldSummary,
@@ -218,35 +219,35 @@ class TwinRun(StagedRun[Case]):
 
 def _frame_rows(
     name: str, result: Result, best: Result, true: FloatArray, inside: BoolArray
-) -> list[TruthCheck]:
+) -> list[Expectation]:
     """What of one photograph was found, against the truth and the best fit of the ansatz."""
     px, found = result.grid.pixel_size, result.displacement()
     left, lost = (rms(field[inside]) / px for field in (true - found, best.displacement() - found))
     rows = [
-        TruthCheck(f"{name}: w = truth − IDIC, rms", left, "as measured", True, "px"),
-        TruthCheck(f"{name}: IDIC − best fit, rms", lost, "small against w", lost < left, "px"),
+        Expectation(f"{name}: w = truth − IDIC, rms", left, "as measured", True, "px"),
+        Expectation(f"{name}: IDIC − best fit, rms", lost, "small against w", lost < left, "px"),
     ]
     if not result.ansatz.modes or not result.ansatz.modes[0].family.size:
         return rows
     if identifiability(result, inside).unobservable:
         words = f"{name}: wave vectors and v1"
-        return [*rows, TruthCheck(words, "not observable", "asked of one that is", True)]
+        return [*rows, Expectation(words, "not observable", "asked of one that is", True)]
     waves = result.ansatz.modes[0].family.waves(result.mode_parameters())[:, 2:4]
     off = 100 * float(np.abs(np.abs(waves) - 1.0).max())
     words = f"{name}: wave vectors, largest deviation from (±½, ±½)"
-    rows.append(TruthCheck.at_most(words, off, _WAVES, "%"))
+    rows.append(Expectation.at_most(words, off, _WAVES, "%"))
     words = f"{name}: v1 − v1 of the best fit, largest over the cellular part, of its maximum"
-    return [*rows, TruthCheck.at_most(words, v_percent(result, best), _AMPLITUDE, "%")]
+    return [*rows, Expectation.at_most(words, v_percent(result, best), _AMPLITUDE, "%")]
 
 
 def whole_checks(
     name: str, refit: Result, best: Result, errors: WholeFieldSummary, inside: BoolArray
-) -> list[TruthCheck]:
+) -> list[Expectation]:
     """What of one photograph's whole displacement was found, against the truth."""
     of, edges = f"{name}: whole displacement", errors.rms_edges_px
     rows = [
-        TruthCheck(f"{of}: truth − measured, rms", errors.rms_px, "as measured", True, "px"),
-        TruthCheck(f"{of}: … within 10 px of an edge", edges or 0.0, "as measured", True, "px"),
+        Expectation(f"{of}: truth − measured, rms", errors.rms_px, "as measured", True, "px"),
+        Expectation(f"{of}: … within 10 px of an edge", edges or 0.0, "as measured", True, "px"),
     ]
     has_pattern = best.ansatz.modes and best.ansatz.modes[0].family.size
     if not has_pattern or identifiability(best, inside).unobservable:
@@ -255,14 +256,14 @@ def whole_checks(
     words = f"{of}: v1 of the refitted ansatz − of the best fit, largest, of its maximum"
     return [
         *rows,
-        TruthCheck.at_most(words, v, _REFIT_AMPLITUDE, "%"),
-        TruthCheck.at_most(f"{of}: wave vectors likewise", waves, _REFIT_WAVES, "%"),
+        Expectation.at_most(words, v, _REFIT_AMPLITUDE, "%"),
+        Expectation.at_most(f"{of}: wave vectors likewise", waves, _REFIT_WAVES, "%"),
     ]
 
 
-def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> TruthCheck:
+def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> Expectation:
     """Rms difference of two distortions per component, without what is affine in it."""
     row, col = np.linspace(0, grid.rows - 1, 60), np.linspace(0, grid.cols - 1, 75)
     found_rms = rms(apart_without_affine(found, true, row[:, None], col[None, :]))
     words = "distortion of the lens: found − true without the affine part, rms per component"
-    return TruthCheck.at_most(words, found_rms, _LENS_PX, "px")
+    return Expectation.at_most(words, found_rms, _LENS_PX, "px")

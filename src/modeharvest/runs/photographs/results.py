@@ -32,6 +32,7 @@ from modeharvest.runs.photographs.prepare import Optics, calibration_text
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import Buckling, ImageAmplitude
+from modeharvest.validation.summary import Expectation
 from modeharvest.validation.whole_field import WholeFieldSummary, whole_numbers
 
 
@@ -89,23 +90,6 @@ class HarvestedFrame:
         return range(len(self.result.ansatz.modes))
 
 
-@dataclass(frozen=True)
-class TruthCheck:
-    """What was obtained against what is expected, both in ``unit`` or in words."""
-
-    quantity: str
-    obtained: float | str
-    expected: float | str
-    ok: bool
-    """Whether the first is as good as the second asks for."""
-    unit: str = ""
-
-    @classmethod
-    def at_most(cls, quantity: str, obtained: float, limit: float, unit: str) -> TruthCheck:
-        """A number that must not be above a limit."""
-        return cls(quantity, obtained, f"≤ {limit:g}", obtained <= limit, unit)
-
-
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
     """The truth of one frame, in the reference frame."""
@@ -125,7 +109,7 @@ class HarvestTruth:
     frames: Mapping[str, FrameTruth]
     """By their names, some may be missing."""
     distortion: Distortion | None = None
-    rows: tuple[TruthCheck, ...] = ()
+    rows: tuple[Expectation, ...] = ()
     """What was found against what is true."""
 
 
