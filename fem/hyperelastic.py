@@ -6,6 +6,7 @@ paper's section "Virtual Experiments". A material states its energy; the rest is
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import dolfinx
@@ -30,14 +31,22 @@ class Hyperelastic:
     ``V`` is the space and ``u`` the displacement [mm] at which everything is assembled;
     ``energy``, ``forces``, ``stiffness`` and ``mass`` (of unit density) are dolfinx forms. The
     mesh is needed on rank 0 only; an InputError refuses other elements than T6.
+
+    parametric : whether ``constants`` has the material's as dolfinx Constants by their names, such
+        as "kappa" or "moduli[0]"; otherwise the forms are compiled with their values, and faster.
     """
 
-    def __init__(self, mesh: Mesh, material: Material, comm: MPI.Comm) -> None:
+    def __init__(
+        self, mesh: Mesh, material: Material, comm: MPI.Comm, parametric: bool = False
+    ) -> None:
         if mesh.element != "T6":
             raise InputError(f"finite elements: expected a T6 mesh, got {mesh.element}")
         domain = dolfinx_api.create_mesh(mesh, comm)
         self.V = dolfinx.fem.functionspace(domain, ("Lagrange", 2, (2,)))
         self.u = dolfinx.fem.Function(self.V)
+        self.constants: dict[str, Any] = {}
+        if parametric:
+            material, self.constants = _with_constants(material, domain)
         test, trial = ufl.TestFunction(self.V), ufl.TrialFunction(self.V)
         F = ufl.Identity(2) + ufl.grad(self.u)
         energy = material.energy(F) * ufl.Measure("dx", domain=domain, metadata=_THREE_POINTS)
@@ -58,6 +67,22 @@ class Hyperelastic:
         """Smallest det F at the corners and mid-sides of this rank's elements [-]."""
         values = self._det_f.eval(self.V.mesh, self._own_cells)
         return float(np.min(values, initial=np.inf))
+
+
+def _with_constants(material: Material, domain: Any) -> tuple[Material, dict[str, Any]]:
+    """The same law with dolfinx Constants instead of its numbers, and those by their names."""
+    constants: dict[str, Any] = {}
+
+    def replaced(name: str, value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(replaced(f"{name}[{k}]", part) for k, part in enumerate(value))
+        constants[name] = dolfinx.fem.Constant(domain, np.float64(value))
+        return constants[name]
+
+    law = copy(material)  # whose own checks are of numbers
+    for name, value in vars(material).items():
+        object.__setattr__(law, name, replaced(name, value))
+    return law, constants
 
 
 class FreeBody:

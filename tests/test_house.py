@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 198, 42_100
+MOST_MODULES, MOST_LINES = 196, 41_786
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -31,7 +31,11 @@ OWN_CELLS = (
     "fem/lattice/geometries.py", "fem/bloch/degenerate.py", "fem/bloch/mesh_error.py",
     "src/modeharvest/runs/lattice/loads.py",
 )  # fmt: skip
-OWN_BOUNDS = {HOMOGENIZATION: (19, 3_810), OWN_CELLS: (7, 960)}
+IDENTIFICATION = (
+    "fem/path/sensitivity.py", "fem/path/parametric.py", "fem/path/equilibrium.py",
+    "fem/hyperelastic.py",
+)  # fmt: skip
+OWN_BOUNDS = {HOMOGENIZATION: (19, 3_810), OWN_CELLS: (7, 960), IDENTIFICATION: (4, 740)}
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 
 PRIVATE_WORDS = """

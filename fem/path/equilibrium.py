@@ -49,6 +49,7 @@ class Structure:
 
     Vectors are PETSc vectors over all displacement components; ``u`` includes the constrained ones.
     ``factorisations`` counts every numerical factorisation. The mesh (T6) is needed on rank 0 only.
+    ``constants`` are the material's that can be changed: all of them if ``parametric``.
     """
 
     def __init__(
@@ -57,9 +58,11 @@ class Structure:
         material: Material,
         loading: EdgeCompression,
         comm: MPI.Comm = MPI.COMM_WORLD,
+        parametric: bool = False,
     ) -> None:
         self.mesh, self.comm = mesh, comm
-        self._forms = Hyperelastic(mesh, material, comm)
+        self._forms = Hyperelastic(mesh, material, comm, parametric)
+        self.constants = self._forms.constants
         self.V, self._u = self._forms.V, self._forms.u
         self._direction, self._along = (dolfinx.fem.Function(self.V) for _ in range(2))
         self._constrain(loading)
@@ -85,11 +88,10 @@ class Structure:
             raise InputError(f"loading: expected nodes on the edges x = +-{half} mm, found none")
         target = self._direction.x.array.reshape(-1, 2)
         target[along, 0] = -0.5 * loading.length * np.sign(x[along, 0])
-        self._shortening = self._direction.x.array.copy()
-        if loading.tilt != 0.0:
-            turning = along[x[along, 0] > 0.0]
-            target[turning, 0] -= loading.tilt * x[turning, 1]
-        self._direction.x.scatter_forward()
+        self._shortening, turning = self._direction.x.array.copy(), along[x[along, 0] > 0.0]
+        self._turning = np.zeros_like(self._shortening)
+        self._turning[2 * turning] = x[turning, 1]
+        self.turn(loading.tilt)
         dofs = 2 * along, 2 * across + 1
         # Only the matrices use these, and there the value is of no account.
         self._bcs = [
@@ -98,6 +100,17 @@ class Structure:
         ]
         fixed = np.union1d(*dofs)
         self._fixed_owned = fixed[fixed < 2 * self.V.dofmap.index_map.size_local]
+
+    def turn(self, tilt: float) -> None:
+        """Have the edge x = +half_width turn by another tilt, see :class:`EdgeCompression`."""
+        self._direction.x.array[:] = self._shortening - tilt * self._turning
+        self._direction.x.scatter_forward()
+
+    def turning(self, strain: float) -> PETSc.Vec:
+        """d(constrained displacements)/d(tilt) at a nominal strain [mm/rad], zero elsewhere."""
+        vector, fixed = self.zero(), self._fixed_owned
+        vector.array[fixed] = -strain * self._turning[fixed]
+        return vector
 
     def zero(self) -> PETSc.Vec:
         """The undeformed state."""
@@ -129,20 +142,29 @@ class Structure:
 
     def residual(self, u: PETSc.Vec) -> PETSc.Vec:
         """Internal forces [N/mm], zero at the constrained components."""
-        vector = self._assemble(self._forms.forces, u)
+        return self.free(self.forces(u))
+
+    def forces(self, u: PETSc.Vec) -> PETSc.Vec:
+        """Internal forces [N/mm], those that hold the constrained components included."""
+        return self._assemble(self._forms.forces, u)
+
+    def forces_along(self, u: PETSc.Vec, direction: PETSc.Vec) -> PETSc.Vec:
+        """How internal forces change along a displacement, K(u) direction, without a matrix."""
+        self._set(self._along, direction)
+        return self._assemble(self._along_form, u)
+
+    def free(self, vector: PETSc.Vec) -> PETSc.Vec:
+        """The vector itself, now zero at the constrained components."""
         vector.array[self._fixed_owned] = 0.0
         return vector
 
     def load(self, u: PETSc.Vec) -> PETSc.Vec:
         """d(internal forces)/d(strain) at fixed free components [N/mm]."""
-        vector = self._assemble(self._load_form, u)
-        vector.array[self._fixed_owned] = 0.0
-        return vector
+        return self.free(self._assemble(self._load_form, u))
 
     def curvature(self, u: PETSc.Vec, direction: PETSc.Vec) -> float:
         """direction . K(u) direction [N], without a matrix: cheap for a single vector."""
-        self._set(self._along, direction)
-        return float(direction.dot(self._assemble(self._along_form, u)))
+        return float(direction.dot(self.forces_along(u, direction)))
 
     def stiffness(self, u: PETSc.Vec) -> PETSc.Mat:
         """Tangent stiffness at ``u`` [N/mm^2], constrained rows identity; the same object again."""
@@ -173,7 +195,11 @@ class Structure:
 
         By virtual work: d(energy)/d(strain) = force * length (+ moment * tilt) at equilibrium.
         """
-        forces, fixed = self._assemble(self._forms.forces, u), self._fixed_owned
+        return self.reaction_of(self.forces(u), length)
+
+    def reaction_of(self, forces: PETSc.Vec, length: float) -> float:
+        """The same of internal forces, or of their change: it is linear in them."""
+        fixed = self._fixed_owned
         work = float(forces.array[fixed] @ self._shortening[fixed])
         return float(self.comm.allreduce(work)) / length
 

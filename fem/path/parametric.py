@@ -1,0 +1,262 @@
+"""A compression test whose material and supports are parameters: its states and sensitivities.
+
+Forms are compiled once, with the parameters as constants. The states of each set of parameters are
+found along the whole path, from the undeformed specimen through its critical point to the branch
+that is asked for, so they do not depend on what was tried before. A tilt comes last: at each state
+of the specimen without it, turned while the strain is kept, which stays on the branch of that name
+where the natural path would lead to whichever branch the tilt favours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.path.bifurcation import Critical, follow_branch, locate_critical
+from modeharvest.fem.path.continuation import BranchPoint, PathFollower, State, load_at, value_at
+from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
+from modeharvest.fem.path.newton import Constraint
+from modeharvest.fem.path.sensitivity import (
+    TILT,
+    TRAVEL,
+    Sensitivity,
+    amplitude_sensitivity,
+    sensitivities,
+)
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+_SIGNS = {"buckled+": 1, "buckled-": -1}
+_SHORTEST = 1 / 64  # of a tilt or of an amplitude, in one step
+_ATTEMPTS = 3  # with shorter and shorter steps
+
+
+@dataclass(frozen=True, eq=False)
+class ParametricState:
+    """An equilibrium state of a test, and its derivatives by the test's ``names``."""
+
+    strain: float
+    """Nominal [-]: that of the test times the travel, or what the amplitude makes it."""
+    displacement: FloatArray
+    """(n, 2) of the mesh's nodes [mm]."""
+    force: float
+    """Compressive, by thickness [N/mm]."""
+    negative_pivots: int
+    branch: str
+    displacement_by: FloatArray
+    """(k, n, 2) [mm per unit of the parameter]."""
+    force_by: FloatArray
+    """(k,) [N/mm per unit]."""
+    strain_by: FloatArray
+    """(k,) [1 per unit]."""
+
+
+class ParametricTest:
+    """The states of a virtual test at its strains, for any values of its unknown parameters.
+
+    experiment : with the values of everything that isn't unknown; of its branches the first counts.
+    names : of the unknowns: "kappa", "moduli[0]" and so on as the material calls its constants,
+        "travel", "tilt" (see ``sensitivity``), and "amplitude[k]" for the state number k, which is
+        then found by the pattern's amplitude [mm] instead of its nominal strain.
+    mesh : T6, of the specimen.
+    """
+
+    def __init__(self, experiment: Experiment, names: Sequence[str], mesh: Mesh) -> None:
+        spec = experiment.specimen
+        pins = spec.mid_junctions if experiment.guided else ()
+        loading = EdgeCompression(spec.half_size[0], spec.length, experiment.edges, 0.0, pins)
+        comm = MPI.COMM_SELF
+        self.structure = Structure(mesh, experiment.material, loading, comm, parametric=True)
+        states = [f"amplitude[{k}]" for k in range(len(experiment.strains))]
+        known = [*self.structure.constants, TRAVEL, TILT, *states]
+        for name in names:
+            if name not in known:
+                raise InputError(f"unknowns: expected some of {known}, got {name!r}")
+        self.experiment, self.names, self.mesh = experiment, tuple(names), mesh
+        self._follower = PathFollower(self.structure, experiment.path)
+        pattern = self.structure.from_function(spec.pattern)
+        weighted = self._follower.mass * pattern
+        self._weights = (1.0 / float(weighted.dot(pattern))) * weighted
+        self.critical_strain: float | None = None
+        """Of the last values, if there is a bifurcation [-]."""
+
+    @property
+    def unknowns(self) -> int:
+        """How many displacements are sought."""
+        return self.mesh.nodes.size
+
+    def amplitude(self, displacement: FloatArray) -> float:
+        """The pattern's amplitude in nodal displacements (n, 2) [mm]: its projection on it."""
+        from_nodes = self.structure.nodal(self._weights)
+        return float(np.sum(from_nodes * displacement))
+
+    def at(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
+        """The states for values of the unknowns (k,), in the order of ``names``.
+
+        InputError if the path does not reach one of them.
+        """
+        given = dict(zip(self.names, map(float, values), strict=True))
+        for name, constant in self.structure.constants.items():
+            constant.value = given.get(name, float(constant.value))
+        travel, tilt = given.get(TRAVEL, 1.0), given.get(TILT, self.experiment.tilt)
+        amplitudes = {k: given.get(f"amplitude[{k}]") for k in range(len(self.experiment.strains))}
+        found = []
+        for k, (state, branch) in enumerate(self._states(travel, amplitudes)):
+            self.structure.turn(0.0)
+            weights = None if amplitudes[k] is None else self._weights
+            turned = self._turned(state, tilt, weights) if tilt != 0.0 else state
+            found.append(self._result(turned, branch, k, travel, weights, with_derivatives))
+        return found
+
+    # -- the path -----------------------------------------------------------------------
+
+    def _states(
+        self, travel: float, amplitudes: dict[int, float | None]
+    ) -> list[tuple[State, str]]:
+        strains = [travel * e for e in self.experiment.strains]
+        by_strain = [e for k, e in enumerate(strains) if amplitudes[k] is None]
+        name = self.experiment.branches[0]
+        path, critical = self._primary(max(strains), by_strain, name)
+        self.critical_strain = None if critical is None else critical.strain
+        buckled: list[State] = []
+        if critical is not None:
+            targets = [e for e in by_strain if e > critical.strain]
+            pitch = self.experiment.specimen.pitch
+            buckled = follow_branch(self._follower, critical, targets, 1, pitch) if targets else []
+        found: list[tuple[State, str]] = []
+        for k, e in enumerate(strains):
+            amplitude = amplitudes[k]
+            if amplitude is not None:
+                state = None if critical is None else self._at_amplitude(critical, amplitude, e)
+                branch = name
+            else:
+                is_buckled = critical is not None and e > critical.strain
+                states, branch = (buckled, name) if is_buckled else (path, "primary")
+                state = next((s for s in states if abs(s.strain - e) < 1e-12), None)
+            if state is None:
+                raise InputError(
+                    f"expected an equilibrium at a nominal strain of {100 * e:.4g} % on the "
+                    f"{branch} path, got none: the path of these parameters does not reach it"
+                )
+            found.append((state, branch))
+        return found
+
+    def _primary(
+        self, largest: float, strains: Sequence[float], name: str
+    ) -> tuple[list[State], Critical | None]:
+        """The primary path through the strains until it becomes unstable, and where that is."""
+        follower, options = self._follower, self.experiment.path
+        self.structure.turn(0.0)
+        follower.options, follower.linearisation, follower.modes = options, None, []
+        path, targets = [follower.start()], sorted({*strains, largest})
+        if not self.experiment.imperfection.is_none:
+            follower.follow_primary(path, targets, refuse_unstable=True)
+            return path, None
+        for _ in range(_ATTEMPTS):
+            follower.follow_primary(path, targets, until_unstable=True)
+            if path[-1].negative_pivots == 0:
+                return path, None
+            critical = locate_critical(follower, path[-2], path[-1])
+            if critical is not None:
+                return path, self._of_branch(critical, name)
+            path.pop()
+            steps = {n: getattr(follower.options, n) / 3.0 for n in ("first_step", "largest_step")}
+            follower.options, follower.linearisation = replace(follower.options, **steps), None
+        follower.follow_primary(path, targets, refuse_unstable=True)
+        return path, None
+
+    def _of_branch(self, critical: Critical, name: str) -> Critical:
+        """The critical point with its mode turned to the branch of that name."""
+        share = float(self._weights.dot(critical.modes[0].vector))
+        if share * _SIGNS.get(name, 1) < 0.0:
+            critical.modes[0] = critical.modes[0].reversed()
+        return critical
+
+    def _at_amplitude(self, critical: Critical, target: float, strain: float) -> State | None:
+        """The state of the branch where the pattern has an amplitude [mm]."""
+        follower, weights = self._follower, self._weights
+        mode = critical.modes[0].vector
+        rate = (1.0 / float(weights.dot(mode))) * mode
+        points = [BranchPoint(0.0, critical.strain, 0.0, critical.u, rate)]
+        origin = self.structure.zero()
+        step, state = min(abs(target), 0.05 * self.experiment.specimen.pitch), None
+        follower.linearisation = None
+        while points[-1].amplitude != target:
+            left = target - points[-1].amplitude
+            amplitude = (
+                target
+                if abs(left) <= 1.1 * step
+                else points[-1].amplitude + (np.copysign(step, left))
+            )
+            constraint = Constraint(weights, origin, float(amplitude))
+            guess = value_at(points, amplitude)
+            at = follower.equilibrium(load_at(points, amplitude), guess, constraint, False)
+            if at is None:
+                step, follower.linearisation = 0.5 * step, None
+                if step < _SHORTEST * abs(target):
+                    return None
+                continue
+            state, by_load = at, 1.0 / float(weights.dot(at.tangent))
+            points.append(BranchPoint(amplitude, at.strain, by_load, at.u, by_load * at.tangent))
+            step *= 2.0
+        return state
+
+    def _turned(self, state: State, tilt: float, weights: PETSc.Vec | None) -> State:
+        """The state of the same strain or amplitude with the edge at x > 0 tilted, in steps."""
+        structure, follower = self.structure, self._follower
+        length, constraint, reached, step = self.experiment.specimen.length, None, 0.0, tilt
+        if weights is not None:
+            constraint = Constraint(weights, structure.zero(), float(weights.dot(state.u)))
+        while reached != tilt:
+            aim = tilt if abs(tilt - reached) <= 1.01 * abs(step) else reached + step
+            structure.turn(reached)
+            (rate,) = sensitivities(structure, state, [TILT], length, weights)
+            guess = state.u + (aim - reached) * rate.displacement
+            strain = state.strain + (aim - reached) * rate.strain
+            structure.turn(aim)
+            follower.linearisation = None
+            found = follower.equilibrium(strain, guess, constraint, with_modes=False)
+            # A small amplitude that the tilt works against is that of an unstable state.
+            is_slip = constraint is None and found and found.negative_pivots > state.negative_pivots
+            if found is None or is_slip:
+                step *= 0.5
+                if abs(step) < _SHORTEST * abs(tilt):
+                    raise InputError(
+                        f"expected an equilibrium at a nominal strain of {100 * state.strain:.4g} "
+                        f"% under a tilt of {tilt:.4g} rad, got none on this branch"
+                    )
+                continue
+            state, reached = found, aim
+        return state
+
+    # -- its states ---------------------------------------------------------------------
+
+    def _result(
+        self, state: State, branch: str, number: int, travel: float, weights: PETSc.Vec | None,
+        with_derivatives: bool,
+    ) -> ParametricState:  # fmt: skip
+        structure, length = self.structure, self.experiment.specimen.length
+        by: list[Sensitivity | None] = []
+        if with_derivatives:
+            own = [n for n in self.names if not n.startswith("amplitude")]
+            parts = sensitivities(structure, state, own, length, weights, travel)
+            known: dict[str, Any] = dict(zip(own, parts, strict=True))
+            if weights is not None:
+                derivative = amplitude_sensitivity(structure, state, length, weights)
+                known[f"amplitude[{number}]"] = derivative
+            by = [known.get(name) for name in self.names]
+        zero = np.zeros_like(self.mesh.nodes)
+        fields = [zero if s is None else structure.nodal(s.displacement) for s in by]
+        return ParametricState(
+            state.strain, structure.nodal(state.u), structure.reaction(state.u, length),
+            state.negative_pivots, branch, np.array(fields).reshape(len(by), *zero.shape),
+            np.array([0.0 if s is None else s.force for s in by]),
+            np.array([0.0 if s is None else s.strain for s in by]),
+        )  # fmt: skip

@@ -1,0 +1,101 @@
+"""Sensitivities of equilibria to material and supports: differences of whole simulations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.materials import Ogden, TwoTermI1
+from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.path.parametric import ParametricTest
+from modeharvest.fem.simulate import simulate
+from modeharvest.fem.specimen import Specimen
+from modeharvest.util.errors import InputError
+
+SMALL = Specimen(4, 4, diameter=1.6, bulk_x=0.9, bulk_y=0.4)
+"""Buckles at 8.0 % with fine elements, and stays stable on its branch."""
+MESH = mesh_specimen(SMALL, 0.6)
+OGDEN = ("moduli[0]", "exponents[0]", "kappa", "travel", "tilt")
+VALUES = np.array([1.2, 3.0, 5.4, 1.0, 0.0])
+BEFORE, AFTER = 0.06, 0.12
+
+
+def made(strains: tuple[float, ...], names: tuple[str, ...], **how: object) -> ParametricTest:
+    return ParametricTest(Experiment(SMALL, strains=strains, mesh_size=0.6, **how), names, MESH)  # type: ignore[arg-type]
+
+
+def require_derivatives(test: ParametricTest, values: np.ndarray) -> None:
+    """Central differences of steps s have errors of order s^2, 1e-7 of the third derivative.
+
+    Equilibria are solved to 1e-11 of strain, of which the smallest step makes some 1e-6 of a slope.
+    """
+    found = test.at(values)
+    for k, value in enumerate(values):
+        step = 3e-4 * max(abs(value), 0.1)
+        moved = np.eye(len(values))[k] * step
+        pairs = zip(test.at(values + moved, False), test.at(values - moved, False), strict=True)
+        for state, (after, before) in zip(found, pairs, strict=True):
+            for name in ("displacement", "force", "strain"):
+                difference = (getattr(after, name) - getattr(before, name)) / (2.0 * step)
+                scale = max(1e-3, float(np.abs(difference).max()))
+                np.testing.assert_allclose(
+                    getattr(state, f"{name}_by")[k], difference, rtol=0, atol=2e-5 * scale
+                )
+
+
+def test_a_parametric_test_is_the_simulation_with_these_parameters() -> None:
+    material = Ogden((0.9,), (2.5,), 4.0)
+    experiment = Experiment(SMALL, material, strains=(BEFORE, AFTER), mesh_size=0.6)
+    direct = simulate(experiment)
+    test = made((BEFORE, AFTER), OGDEN)
+    found = test.at(np.array([0.9, 2.5, 4.0, 1.0, 0.0]), with_derivatives=False)
+    assert test.critical_strain == pytest.approx(direct.info["critical"]["strain"], abs=1e-8)
+    for state, snapshot in zip(found, direct.snapshots, strict=True):
+        assert (state.branch, state.negative_pivots) == (snapshot.branch, 0)
+        np.testing.assert_allclose(state.displacement, snapshot.displacement, rtol=0, atol=1e-9)
+        assert state.force == pytest.approx(snapshot.reaction, rel=1e-9)
+
+
+def test_before_and_after_buckling() -> None:
+    test = made((BEFORE, AFTER), OGDEN)
+    require_derivatives(test, VALUES)
+    assert BEFORE < test.critical_strain < AFTER
+
+
+def test_on_the_other_branch_of_a_tilted_specimen() -> None:
+    """Whichever the tilt favours: with both signs of it the pattern has that of the branch."""
+    test = made((AFTER,), ("kappa", "tilt"), branches=("buckled-",))
+    for tilt in (0.02, -0.02):
+        (state,) = test.at(np.array([5.4, tilt]), with_derivatives=False)
+        assert test.amplitude(state.displacement) < -0.1
+    require_derivatives(test, np.array([5.4, 0.02]))
+
+
+def test_at_the_bifurcation_with_the_amplitude_as_an_unknown() -> None:
+    """The strain there follows; at small amplitudes its derivatives are the critical strain's."""
+    tilted = made((0.1,), ("kappa", "tilt", "amplitude[0]"))
+    require_derivatives(tilted, np.array([5.4, 0.01, 0.2]))
+    test = made((0.1,), ("exponents[0]", "kappa", "amplitude[0]"))
+    require_derivatives(test, np.array([3.0, 5.4, 0.03]))
+    (state,) = test.at(np.array([3.0, 5.4, 1e-3]))
+    assert state.strain == pytest.approx(test.critical_strain, abs=3e-6)  # 2.1 a^2
+    assert test.amplitude(state.displacement) == pytest.approx(1e-3, abs=1e-9)
+    criticals = []
+    for kappa in (5.4 + 1e-4, 5.4 - 1e-4):
+        test.at(np.array([3.0, kappa, 1e-3]), with_derivatives=False)
+        criticals.append(test.critical_strain)
+    # Both are located to 1e-7 at most, in fact some 1e-11.
+    assert state.strain_by[1] == pytest.approx((criticals[0] - criticals[1]) / 2e-4, rel=1e-3)
+
+
+def test_another_material() -> None:
+    test = made((BEFORE,), ("c1", "c2", "bulk"), material=TwoTermI1())
+    require_derivatives(test, np.array([0.55, 0.3, 55.0]))
+
+
+def test_what_it_is_not_made_for() -> None:
+    with pytest.raises(InputError, match=r"expected some of .*'kappa'.*'tilt'.*got 'mu'"):
+        made((BEFORE,), ("mu",))
+    with pytest.raises(InputError, match=r"15 % on the buckled\+ path, got none"):
+        made((0.15,), ("amplitude[0]",)).at(np.array([5.0]))
