@@ -142,7 +142,12 @@ def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = (
         if modes.origin is not None:
             file["origin"] = modes.origin
         for k, branch in enumerate(branches):
-            _write_branch(file.create_group(f"branches/{k:04d}"), branch)
+            group = file.create_group(f"branches/{k:04d}")
+            group.attrs["outcome"] = branch.outcome
+            group["combination"] = np.asarray(branch.combination, dtype=np.float64)
+            group["curve"] = branch.curve
+            for n, state in enumerate(branch.states):
+                write_values(group.create_group(f"states/{n:04d}"), state)
 
 
 def read_modes(path: Path | str) -> tuple[ModeSet, tuple[Branch, ...]]:
@@ -169,14 +174,6 @@ def write_vtu(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ())
 def write_xdmf(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
     """Write modes and branches as XDMF with all numbers in the one file, atomically."""
     _write_meshio(path, modes, branches, "xdmf", data_format="XML")
-
-
-def _write_branch(group: h5py.Group, branch: Branch) -> None:
-    group.attrs["outcome"] = branch.outcome
-    group["combination"] = np.asarray(branch.combination, dtype=np.float64)
-    group["curve"] = branch.curve
-    for k, state in enumerate(branch.states):
-        write_values(group.create_group(f"states/{k:04d}"), state)
 
 
 def _read_branch(group: h5py.Group, modes: ModeSet) -> Branch:

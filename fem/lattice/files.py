@@ -138,15 +138,12 @@ def _from_model(
         except InputError as error:
             raise InputError(f"{source}: {error}") from error
         except Exception as error:  # gmsh raises nothing else
+            why = " ".join((str(error) or gmsh.logger.getLastError()).split())
             raise InputError(
-                f"{source}: gmsh can't mesh it ({_message(error)}); holes must neither overlap nor "
+                f"{source}: gmsh can't mesh it ({why}); holes must neither overlap nor "
                 "touch each other"
             ) from error
     return _unit_cell(*_current_mesh(), lattice, source, unit)
-
-
-def _message(error: Exception) -> str:
-    return " ".join((str(error) or gmsh.logger.getLastError()).split())
 
 
 def _current_mesh() -> tuple[FloatArray, Blocks, IntArray]:

@@ -63,7 +63,10 @@ def find_holes(mask: ArrayLike, smallest_px2: float | None = None) -> Holes:
     areas = np.bincount(parts.ravel(), minlength=count + 1).astype(np.float64)
     inner = np.setdiff1d(np.arange(1, count + 1), border)
     if smallest_px2 is None:
-        smallest_px2 = _MUCH_SMALLER * _typical(areas[inner]) if inner.size else 0.0
+        # By the area above which half of all the hole area lies: many specks don't change it.
+        ordered = np.sort(areas[inner])[::-1]
+        half = np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())
+        smallest_px2 = _MUCH_SMALLER * float(ordered[half]) if inner.size else 0.0
     large = inner[areas[inner] >= smallest_px2]
     centres = np.array(center_of_mass(~material, parts, large), dtype=np.float64)
     return Holes(
@@ -72,12 +75,6 @@ def find_holes(mask: ArrayLike, smallest_px2: float | None = None) -> Holes:
         too_small=int(inner.size - large.size),
         at_border=int(border.size),
     )
-
-
-def _typical(areas: FloatArray) -> float:
-    """The area above which half of all the hole area lies: many specks don't change it."""
-    ordered = np.sort(areas)[::-1]
-    return float(ordered[np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())])
 
 
 def spanning_vectors(spots: FloatArray) -> FloatArray | None:

@@ -232,10 +232,12 @@ def _amplitudes(waves: list[RealWave], ties: list[Tie]) -> list[str]:
     for tie in ties:
         if len(tie.waves) > 1 and tie.value > 0:
             where = ("along", "across")[tie.component]
+            values = np.array([waves[w].amplitude[tie.component] for w in tie.waves])
+            signs = " ".join("+" if value > 0 else "−" for value in values * values[0])
             text.append(
                 f"The amplitude {where} the wave vector is the same in waves "
                 f"{', '.join(str(w + 1) for w in tie.waves)} within {100 * SAME_AMPLITUDE:.0f} %, "
-                f"signs {_signs(tie, waves)}."
+                f"signs {signs}."
             )
     split = {w for w, wave in enumerate(waves) if wave.shares_k}
     split |= {w - 1 for w in split}
@@ -243,12 +245,6 @@ def _amplitudes(waves: list[RealWave], ties: list[Tie]) -> list[str]:
     if zero:
         text.append(f"Zero within {100 * SAME_AMPLITUDE:.0f} %: {', '.join(zero)}.")
     return text
-
-
-def _signs(tie: Tie, waves: list[RealWave]) -> str:
-    """Relative to the first."""
-    values = np.array([waves[w].amplitude[tie.component] for w in tie.waves])
-    return " ".join("+" if value > 0 else "−" for value in values * values[0])
 
 
 def _family(family: ModeFamily, ties: list[Tie]) -> str:

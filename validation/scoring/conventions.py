@@ -300,7 +300,9 @@ class _FieldSample:
         blocks = len(np.unique(block))
         if blocks < _FEWEST_BLOCKS:
             return False
-        weight = _weights(np.minimum(_length(mine), _length(others)))
+        size = np.minimum(_length(mine), _length(others))
+        bound = 3.0 * float(np.median(size)) + 1e-9
+        weight = bound / np.maximum(size, bound)  # little for outliers
         share, sd = _share(mine, mine - others, weight, block)
         affine = np.column_stack([np.ones(len(block)), self.x[known], self.y[known]])
         mine, others = (_less(error, affine, weight) for error in (mine, others))
@@ -310,12 +312,6 @@ class _FieldSample:
             and abs(share - 1.0) < _INEXACT + 3.0 * sd
             and abs(varying - 1.0) < _INEXACT + 3.0 * its_sd
         )
-
-
-def _weights(size: FloatArray) -> FloatArray:
-    """(n,) weights of points by the length of their errors: little for outliers."""
-    bound = 3.0 * float(np.median(size)) + 1e-9
-    return bound / np.maximum(size, bound)
 
 
 def _share(

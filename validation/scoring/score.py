@@ -164,7 +164,10 @@ def score(
     error = np.asarray((field.u - truth) / grid.pixel_size, dtype=np.float64)
     spacing_px = max(1.0, _spacing_px(field.x[on_material], field.y[on_material], grid))
     reach_px = min(spacing_px, reach_px)
-    near = _near(field, used, reach_px, grid) & (labels >= 0)
+    row, col = grid.to_px(field.x[used], field.y[used])
+    met = np.zeros(grid.shape, dtype=np.bool_)
+    met[np.rint(row).astype(int), np.rint(col).astype(int)] = True
+    near = grown(met, reach_px) & (labels >= 0)
 
     def over(part: BoolArray) -> RegionScore:
         return RegionScore.of(error[part], field.good[part])
@@ -234,14 +237,6 @@ def _to_nearest(points: FloatArray) -> FloatArray:
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     some = points[:: -(-len(points) // _ENOUGH_POINTS)]
     return np.asarray(tree.query(some, k=2)[0][:, 1])
-
-
-def _near(field: LocalField, used: BoolArray, reach_px: float, grid: PixelGrid) -> BoolArray:
-    """(rows, cols) True where a used point is no farther."""
-    row, col = grid.to_px(field.x[used], field.y[used])
-    met = np.zeros(grid.shape, dtype=np.bool_)
-    met[np.rint(row).astype(int), np.rint(col).astype(int)] = True
-    return grown(met, reach_px)
 
 
 BANDS_AN_OCTAVE = 3

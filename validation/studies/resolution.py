@@ -100,7 +100,8 @@ def _noise(case: Case, spec: ResolutionSpec) -> Row:
     row: Row = {}
     for degree in spec.measured:
         found = spec.correlate(pair, degree, motion)
-        errors = _errors(spec, found, _noise_free(spec, motion, degree))
+        v0, v1, v1phi1 = _changes(_noise_free(spec, motion, degree), found, spec.sparse[0])
+        errors = _rms_px(spec, v0, v1, v1phi1, v0 + v1phi1)
         predicted = _predicted(spec, found, found.covariance(spec.noise))
         row |= {f"{key}_{degree}": value for key, value in errors.items()}
         row |= {f"predicted_{key}_{degree}": value for key, value in predicted.items()}
@@ -113,12 +114,6 @@ def _predicted(spec: ResolutionSpec, result: Result, covariance: FloatArray) -> 
     points, _ = spec.sparse
     sd = field_errors(result, points[:, 0, None], points[:, 1, None], covariance)
     return _rms_px(spec, sd.v0, sd.v[0], sd.fluctuation[0], sd.displacement)
-
-
-def _errors(spec: ResolutionSpec, found: Result, quiet: Result) -> Row:
-    """Rms differences of the fields of two results [px]."""
-    v0, v1, v1phi1 = _changes(quiet, found, spec.sparse[0])
-    return _rms_px(spec, v0, v1, v1phi1, v0 + v1phi1)
 
 
 def _rms_px(

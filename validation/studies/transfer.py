@@ -132,8 +132,7 @@ class TransferCurves:
             for k, (part, axis) in enumerate(kinds):
                 here = slice(k * 2 * _PERIODS, (k + 1) * 2 * _PERIODS)
                 for found, fit in ((own, parts[part]), (whole, parts["v0"] + parts["v1"])):
-                    shares = _over_phases(fit[..., here], waves[..., here])
-                    found[part, axis, degree] = shares
+                    found[part, axis, degree] = _over_phases(fit[..., here], waves[..., here])
         return cls(periods, own, whole)
 
     def at(self, part: str, axis: int, degree: int, period: float) -> float:

@@ -243,13 +243,9 @@ def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
                 child.kill()
 
 
-def _main() -> None:
+if __name__ == "__main__":
     try:
         pickle.load(sys.stdin.buffer)(silent)
     except InputError as error:
         print(error, file=sys.stderr)
         sys.exit(_REFUSED)
-
-
-if __name__ == "__main__":
-    _main()

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.photograph.holes import HoleLattice
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.spectra.pattern import WavePattern
@@ -269,12 +268,10 @@ def truth_of(state: PhotographState) -> FrameTruth | None:
     return None if truth is None else truth.frames.get(state.frame.name)
 
 
-def _true_displacement(state: PhotographState) -> FloatArray | None:
-    truth = truth_of(state)
-    return None if truth is None else truth.displacement
-
-
-WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(lambda s: s.frame.whole, _true_displacement)
+WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(
+    lambda s: s.frame.whole,
+    lambda s: None if (truth := truth_of(s)) is None else truth.displacement,
+)
 
 WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
 _LEGEND = 0.26  # [in]
@@ -295,7 +292,10 @@ def draw_reference(harvest: Harvest, boundary: MeshBoundary, levels: tuple[float
     shown = [Line2D([], [], color=GOLD, lw=1.2, label="material")]
     if harvest.geometry.lattice is not None:
         shown += _draw_lattice(axes, harvest.geometry.lattice, harvest.grid)
-    shown.append(_draw_box(axes, harvest.geometry.region.cellular))
+    box = harvest.geometry.region.cellular
+    axes.add_patch(Rectangle((box.x_min, box.y_min), box.x_max - box.x_min, box.y_max - box.y_min,
+                             fill=False, ec=RED, lw=1.3, ls=(0, (4, 2))))  # fmt: skip
+    shown.append(Line2D([], [], color=RED, lw=1.3, ls=(0, (3, 1.5)), label="part with holes"))
     axes.legend(handles=shown, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shown),
                 handlelength=1.6, columnspacing=1.4, borderaxespad=0.1)  # fmt: skip
     return drawn
@@ -344,13 +344,6 @@ def _coloured(grid: PixelGrid, length: FloatArray) -> Figure:
     axes.set(xlim=(-0.5, grid.cols - 0.5), ylim=(grid.rows - 0.5, -0.5))
     maps.colour_bar(axes, scale)
     return drawn
-
-
-def _draw_box(axes: Axes, box: Box) -> Line2D:
-    """The part of the specimen that has holes."""
-    axes.add_patch(Rectangle((box.x_min, box.y_min), box.x_max - box.x_min, box.y_max - box.y_min,
-                             fill=False, ec=RED, lw=1.3, ls=(0, (4, 2))))  # fmt: skip
-    return Line2D([], [], color=RED, lw=1.3, ls=(0, (3, 1.5)), label="part with holes")
 
 
 def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Line2D]:
