@@ -96,11 +96,111 @@ def test_cases_prints_a_case_that_can_be_run(
     assert Case.read(mine) == Case.read("paper-virtual")
 
 
-@pytest.mark.parametrize("arguments", [("bogus",), ("run",), ("run", "paper-virtual")])
-def test_wrong_usage_is_exit_code_2(
-    monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+def usage_line(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    """What is wrong with a call, printed as one line and nothing else; where help is, is said."""
+    text, where = capsys.readouterr(), " ".join(("modeharvest", *command))
+    (line,) = text.err.splitlines()
+    assert text.out == ""
+    assert line.startswith(f"error: {where}: ")
+    assert line.endswith(f" See {where} --help")
+    return line.removeprefix(f"error: {where}: ").removesuffix(f" See {where} --help")
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_an_unknown_option_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    assert called(monkeypatch, *command, "--zzz") == 2
+    assert usage_line(capsys, *command) == "no such option: --zzz."
+    if command != ("cases",):
+        assert called(monkeypatch, *command, "--ot", "x") == 2
+        wrong, near = usage_line(capsys, *command).split(". Did you mean ")
+        assert wrong == "no such option: --ot"
+        assert "--out" in near.rstrip("?").split(" or ")
+        assert called(monkeypatch, *command, "--out") == 2
+        assert usage_line(capsys, *command) == "option '--out' requires an argument."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "missing"),
+    [
+        (("run",), "argument CASE: A shipped case ('modeharvest cases' lists them) or a TOML"),
+        (("run", "paper-virtual"), "option --out DIR: Folder for everything this case leaves."),
+        (("harvest",), "argument EXPERIMENT.toml: "),
+        (("measure", "a.tif", "--out", "x"), "argument DEFORMED...: Images, in the order of"),
+        (("study",), "argument STUDY: robustness, noise, systematic, modes or resolution; or"),
+        (("score", "a.csv", "--strain", "0.1"), "option --truth DIR: The truth's folder."),
+        (("score", "a.csv", "--truth", "x"), "option --strain: Of the image that was measured."),
+        *((command, "argument ") for command in COMMANDS if command[-1] not in ("star", "cases")),
+        (("benchmark", "star"), "option --out DIR: Folder for the set."),
+    ],
+)
+def test_what_is_missing_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    missing: str,
 ) -> None:
     assert called(monkeypatch, *arguments) == 2
+    command = arguments[: 2 if arguments[0] == "benchmark" else 1]
+    assert usage_line(capsys, *command).startswith(f"missing {missing}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("study noise --out x --workers two", "--workers: expected a valid integer, got 'two'."),
+        ("measure a b --out x --pixel-size ?", "--pixel-size: expected a valid number, got '?'."),
+        ("measure a b --out x --brightness 0.5", "--brightness: expected a valid integer, got"),
+        ("score a --truth x --strain big --out x", "--strain: expected a valid number, got 'big'."),
+        ("score a --first-pixel one", "--first-pixel: expected a valid integer, got 'one'."),
+        ("resolution a --first-pixel one", "--first-pixel: expected a valid integer, got 'one'."),
+        ("star --out x --noise much", "--noise: expected a valid number, got 'much'."),
+        ("star --out x --rows 3.5", "--rows: expected a valid integer, got '3.5'."),
+        ("run paper-virtual again --out x", "got unexpected extra argument(s) (again)."),
+        ("run paper-virtual --out x --whole-field=1", "option '--whole-field' does not take a"),
+    ],
+)
+def test_a_wrong_type_or_number_of_arguments_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: str,
+    message: str,
+) -> None:
+    command, *rest = arguments.split()
+    path = ("benchmark", command) if ("benchmark", command) in COMMANDS else (command,)
+    assert called(monkeypatch, *path, *rest) == 2
+    assert usage_line(capsys, *path).startswith(message)
+
+
+def test_an_unknown_command_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, message in (
+        (("bogus",), "no such command 'bogus'."),
+        (("rum",), "no such command 'rum'. Did you mean 'run'?"),
+        (("--bogus",), "no such option: --bogus."),
+        (("benchmark", "mak"), "no such command 'mak'. Did you mean 'make'?"),
+    ):
+        assert called(monkeypatch, *arguments) == 2
+        assert usage_line(capsys, *arguments[:-1]) == message
+
+
+@pytest.mark.parametrize("command", [(), ("benchmark",)])
+def test_without_a_command_there_is_help(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    assert called(monkeypatch, *command) == 2
+    text = capsys.readouterr()
+    assert " ".join(("Usage: modeharvest", *command)) in text.out
+    assert text.err.strip() == ""
+
+
+def test_the_program_has_its_name_however_it_is_started() -> None:
+    started = [sys.executable, "-m", "modeharvest", "run", "--help"]
+    assert "Usage: modeharvest run" in subprocess.run(
+        started, check=True, capture_output=True, text=True
+    ).stdout  # fmt: skip
 
 
 def test_unknown_case(

@@ -117,6 +117,10 @@ was_interrupted = False
 while it looks for a kernel, and PETSc makes another one of it."""
 
 
+UsageError: type[Any] = typer.BadParameter.__bases__[0]
+"""click's, which newer versions of typer carry within themselves."""
+
+
 class InterruptionError(Exception):
     """Ctrl-C, under a name that the command-line library does not take for its own."""
 
@@ -154,12 +158,14 @@ def report_error(error: BaseException) -> int:
     if was_interrupted or isinstance(error, (InterruptionError, KeyboardInterrupt)):
         _print("interrupted; run the same command again to continue where it stopped")
         return INTERRUPTED
-    _print(f"[red]error:[/red] {escape(_line(error))}")
+    if line := _line(error):
+        _print(f"[red]error:[/red] {escape(line)}")
     return UNUSABLE if isinstance(error, _FORESEEN) else FAULT
 
 
 _FORESEEN = (
-    InputError, MissingDependencyError, MemoryError, OSError, UnicodeError, RecursionError,
+    InputError, UsageError, MissingDependencyError, MemoryError, OSError, UnicodeError,
+    RecursionError,
 )  # fmt: skip
 
 
@@ -169,7 +175,9 @@ def _print(line: str) -> None:
 
 
 def _line(error: BaseException) -> str:
-    """An error in one line."""
+    """An error in one line; empty where all was printed already."""
+    if isinstance(error, UsageError):
+        return _usage(error)
     if isinstance(error, (InputError, MissingDependencyError)):
         return " ".join(str(error).split())
     if isinstance(error, MemoryError):
@@ -181,6 +189,24 @@ def _line(error: BaseException) -> str:
     if isinstance(error, _FORESEEN):
         return what
     return f"a fault in modeharvest itself ({what:.200}); please report it with {_log(error)}"
+
+
+def _usage(error: Any) -> str:
+    """A command line that can't be understood; empty where none was given: the help is printed."""
+    what, where = " ".join(error.format_message().split()), error.ctx.command_path
+    if (param := getattr(error, "param", None)) is not None:
+        option = param.opts[0] if param.param_type_name == "option" else ""
+        if not error.message:
+            name = " ".join(filter(None, (param.param_type_name, option, param.metavar)))
+            what = f"missing {name}: {param.help}"
+        elif hasattr(error.__cause__, "errors"):  # pydantic's
+            first = error.__cause__.errors()[0]
+            expected = first["msg"].partition(",")[0].replace("Input should be", "expected")
+            what = f"{option or param.metavar}: {expected}, got {first['input']!r}"
+    if near := getattr(error, "possibilities", None):
+        what = f"{error.message}. Did you mean {' or '.join(sorted(near))}?"
+    stop = "" if what.endswith(("?", ".")) else "."
+    return what and f"{where}: {what[0].lower()}{what[1:]}{stop} See {where} --help"
 
 
 def _log(error: BaseException) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import os
 import signal
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand
 
 from modeharvest.cli import benchmark, commands, homogenization, messages
 from modeharvest.util import __version__
@@ -55,28 +55,35 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
 }  # fmt: skip
 
 
-def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, whose interruptions the command-line library leaves to us."""
+class _Command(TyperCommand):
+    """A command whose interruptions and errors the command-line library leaves to us."""
 
-    @functools.wraps(command)
-    def run_command(*arguments: Any, **options: Any) -> None:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:
-            command(*arguments, **options)
+            return super().parse_args(ctx, args)
+        except messages.UsageError as error:
+            error.ctx = ctx  # an option without its value doesn't know
+            raise
+
+    def invoke(self, ctx: Any) -> None:
+        try:
+            super().invoke(ctx)
             messages.end_if_interrupted()
         except KeyboardInterrupt as error:
             raise messages.InterruptionError from error
 
-    # The library would keep the source's line breaks, in a terminal of any width.
+
+def _help(command: Callable[..., None]) -> str:
+    """Of a command, without the source's line breaks, which the library would keep."""
     paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
-    run_command.__doc__ = "\n\n".join(" ".join(text.split()) for text in paragraphs)
-    return run_command
+    return "\n\n".join(" ".join(text.split()) for text in paragraphs)
 
 
 for family, members in _FAMILIES.items():
     for command in members:
-        app.command(rich_help_panel=family)(_interruptible(command))
+        app.command(cls=_Command, help=_help(command), rich_help_panel=family)(command)
 for command in (benchmark.make, benchmark.star, benchmark.resolution):
-    benchmark_app.command()(_interruptible(command))
+    benchmark_app.command(cls=_Command, help=_help(command))(command)
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
 
 
@@ -110,7 +117,7 @@ def main() -> None:
 def _run() -> None:
     try:
         try:
-            app()
+            sys.exit(app(prog_name="modeharvest", standalone_mode=False))
         finally:
             sys.stdout.flush()  # a full disk shows now or never
     except SystemExit:
