@@ -100,7 +100,11 @@ ROWS = (
         for f, g in ((1, 1), (1, 0), (0, 1))
         for s in (0.002, 0.01, 0.04)
     ),
-    *(Row(0.002, in_g, 3.0, 5) for in_g in (0.002, 0.0)),
+    *(
+        Row(0.002 * f, 0.002 * g, 3.0, degree)
+        for degree in (4, 5)
+        for f, g in ((1, 1), (1, 0), (0, 1))
+    ),
     *(Row(s, s, 6.0, degree) for degree in (3, 5) for s in (0.01, 0.04)),
     *(Row(s, s, 8.0) for s in (0.002, 0.01, 0.04)),
     *(Row(s, s, options=LEAST_SQUARES) for s in (0.002, 0.01, 0.04)),

@@ -131,6 +131,24 @@ def test_a_low_pass_filter_leaves_nothing_at_the_nyquist_limit(size_px: float) -
     assert np.var(slopes(noise)) == pytest.approx(filtered.slope_noise(11), rel=0.1)
 
 
+def test_what_alternates_from_pixel_to_pixel_is_not_weighed_at_the_edges_of_the_mask() -> None:
+    """Aliasing does; inside, the filter's slopes have nothing in common with it.
+
+    A sum that ends all at once takes half of its last pixel's share of it, whatever the filter:
+    chi squared of the unknowns was 1.055 for that, at 0.2 % of noise on speckle of 3 px.
+    """
+    mask, filtered = MASK.copy(), Weighting(Gradient.REFERENCE, 0.0, 3.0, low_pass=True)
+    mask[60:90, 50:80] = False
+    f, _ = pair()
+    level = level_pair(ImagePair(f, f, GRID, mask), FULL, edge_px=2, order=11)
+    used = Assembly(ANSATZ, GRID, level.mask)
+    h = instrument(filtered, ImagePair(f, f, GRID, mask), level, used, np.zeros(ANSATZ.size))[:2]
+    row, col = np.indices(GRID.shape)
+    for alternating in ((-1.0) ** row, (-1.0) ** col, (-1.0) ** (row + col)):
+        found = (h * alternating)[:, level.mask].sum(axis=1)
+        assert (found**2 < 5e-3 * np.square(h[:, level.mask]).sum(axis=1)).all()
+
+
 def test_half_of_a_wave_is_left_where_its_aliased_part_is_a_hundredth_of_it() -> None:
     """By the power spectrum of a speckle whose autocorrelation is 3 px wide, a Gaussian."""
     L = 3.0 / np.sqrt(8.0 * np.log(2.0))

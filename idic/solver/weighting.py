@@ -202,6 +202,9 @@ def instrument(
         rest = np.zeros_like(a)
         made = warped_back(used, rest, level.reference, SplineImage.of(f, order))
         push_forward(used, a, made)
+    if weighting.low_pass:  # a sharp edge would let through what the filter has taken away
+        cells = ndimage.binary_erosion(used.mask, np.ones((2, 2))).astype(np.float32)
+        made[:2] *= ndimage.uniform_filter(cells, 2, mode="constant", origin=-1)
     if used.ansatz.brightness.gain_degree is not None:
         made[2] = _neighbours(pair.reference, f_mask, max(weighting.blur_px, _NEIGHBOURS_PX))
     return made
