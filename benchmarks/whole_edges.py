@@ -4,7 +4,8 @@ On the images of a virtual experiment (``modeharvest run paper-virtual --out FOL
 with noise. The error at a pixel is the sum of
 
 - mesh: the best fit of the elements to the truth over all pixels, less the truth;
-- smoothing: what the regularisation takes away of that fit, A^-1 lambda R (u_0 - u);
+- smoothing: what the regularisation takes away of that fit, A^-1 lambda R (u_0 - u), and what of
+  that is put back;
 - images: what else exact images leave at the same cut-off wavelength: splines between pixels,
   pixels continued beyond edges, steps that are not linear;
 - noise: what camera images leave more, by quantisation or noise.
@@ -87,6 +88,7 @@ def causes(
     weight = at.weight(found.cutoff_px * px)
     off = best.ravel() - at.prior.start  # type: ignore[union-attr]
     lost = -at.factor(weight).solve(weight * (at.R @ off)).reshape(-1, 2)
+    lost += clean.displacement - course.u.reshape(-1, 2)
     of = {
         "all": found.displacement_on() - true,
         "mesh": found.on_pixels(best) - true,

@@ -135,6 +135,28 @@ def test_edges_count_by_what_another_row_of_pixels_changes(
     assert np.linalg.norm(result.roots[..., -1] - change) < 0.2 * np.linalg.norm(change)
 
 
+def test_what_smoothing_takes_is_put_back_where_it_stands_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def peak(points: np.ndarray) -> np.ndarray:
+        """1.5 px high and 16 px wide, where nothing else moves."""
+        square = ((points - [-0.8, 0.5]) ** 2).sum(axis=-1, keepdims=True)
+        return 0.015 * np.exp(-0.5 * square / 0.16**2) * np.array([1.0, -1.0])
+
+    pair, options = plate_pair(peak, 0.01), replace(COARSE, cutoff_px=60.0)
+    back = measure_displacement(pair, at_rest, options=options)
+    monkeypatch.setattr("modeharvest.idic.finite_element.cutoff._STANDS_OUT", np.inf)
+    taken = measure_displacement(pair, at_rest, back.mesh, options=options)
+    nodes = back.mesh.nodes
+    apart = np.linalg.norm(nodes - [-0.8, 0.5], axis=1)
+    off, before = (
+        one.displacement[apart < 0.3] - peak(nodes[apart < 0.3]) for one in (back, taken)
+    )
+    assert np.sqrt(np.mean(off**2)) < 0.75 * np.sqrt(np.mean(before**2))
+    same = (back.displacement == taken.displacement).all(axis=1)
+    assert same[apart > 1.0].mean() > 0.95
+
+
 def test_found_cutoff_is_nearly_the_best(noisy: tuple[ImagePair, NodalResult]) -> None:
     pair, result = noisy
     rms = [

@@ -25,6 +25,11 @@ a node is noise. With a material law a larger weight says little, because errors
 same at all long wavelengths. There the truth is taken to be at most as far from the solution with
 the law as that without it is, d, and most probably with it, which adds the variance d^2/6 of a
 triangular distribution (Guide to the Expression of Uncertainty in Measurement, JCGM 100, 4.3.9).
+
+Smoothing takes A^-1 lambda R(u - u_0) from the true displacement u. That of the measured one is put
+back where it stands out from noise and the elements' own error: J. Tukey's twicing, a second step
+of iterated Tikhonov regularisation, at the few places, tips of holes first of all, that are rougher
+than the cut-off wavelength was found for.
 """
 
 from __future__ import annotations
@@ -52,6 +57,8 @@ _OF_SLOPES = 2.0
 """Bias of gradients over what that shows: waves that are gone (half, in k^-3.5) can't change."""
 _SIGNIFICANT = 3.0
 """Standard deviations."""
+_STANDS_OUT, _SOME = 6.0, 8
+"""Square of what smoothing takes over its variance, around a node; random vectors to know that."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +126,8 @@ class Deviations(NamedTuple):
     """(n, 2) of u by that, and by the elements' own error [mm]."""
     gradient: FloatArray
     """(n, 4, 4) covariance by both of xx, xy, yx, yy of grad u [-]."""
+    taken: FloatArray | float = 0.0
+    """(n, 2) what smoothing has taken from u, where that stands out [mm]."""
 
     @property
     def by_noise(self) -> FloatArray:
@@ -136,19 +145,17 @@ class Deviations(NamedTuple):
         """Count a possible change (n, 2) of u [mm], rms around nodes; its slope so many times."""
         slope = of_slopes * nodal_gradient(mesh, change)
         spread = smoothed(mesh, np.einsum("nij,nkl->nijkl", slope, slope))
-        return Deviations(
-            self.samples,
-            self.lost,
-            np.concatenate([self.changes, change[..., None]], axis=2),
-            np.sqrt(self.bias**2 + smoothed(mesh, change**2)),
-            self.gradient + spread.reshape(-1, 4, 4),
+        return self._replace(
+            changes=np.concatenate([self.changes, change[..., None]], axis=2),
+            bias=np.sqrt(self.bias**2 + smoothed(mesh, change**2)),
+            gradient=self.gradient + spread.reshape(-1, 4, 4),
         )
 
 
 def deviations(
     at: Linearised, cutoff: float, noise: float, in_gradient: FloatArray, unknowns: float
 ) -> Deviations:
-    """Estimate what noise and smoothing make of u.
+    """Estimate what noise and smoothing make of u, and what smoothing has taken from it.
 
     By noise, A^-1 e for random e of the covariance M times that of the noise, more of it in
     elements with larger residuals, with what the regularisation allows for where there is no
@@ -165,6 +172,7 @@ def deviations(
     random = at.body.samples(at.sums.blocks * scale)
     found = noise * factor.solve(random).reshape(-1, 2, SAMPLES)
     lost = none = found[..., :0]
+    error, back = interpolation_error(mesh, at.u.reshape(-1, 2)), 0.0
     if isinstance(at.prior, Smoothness):  # what a law allows is not known
         lost = factor.solve(at.body.smoothness_samples).reshape(-1, 2, SAMPLES)
         blank = mean_around(mesh, np.repeat(1.0 - at.signal, 6).reshape(-1, 6))
@@ -173,11 +181,17 @@ def deviations(
         rough = weight * grown / max(noise**2 * unknowns, _TINY)
         wide = noise * np.sqrt(weight * blank * max(at.mean(in_gradient), rough))
         found += wide[:, None, None] * lost
+        noisy = at.R @ found[..., :_SOME].reshape(at.u.size, _SOME)
+        both = weight * factor.solve(np.column_stack([at.penalty, noisy]))
+        taken, *by_noise = np.moveaxis(both.reshape(-1, 2, 1 + _SOME), 2, 0)
+        parts = taken**2, np.mean(np.square(by_noise), axis=0) + error**2
+        square, variance = (smoothed(mesh, part).sum(axis=1, keepdims=True) for part in parts)
+        back = smoothed(mesh, (square > _STANDS_OUT * variance).astype(float)) * taken
     change = (at.step(cutoff, _STRONGER) - here).reshape(-1, 2)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
-    error = interpolation_error(mesh, at.u.reshape(-1, 2))
-    return Deviations(found, lost, none, error, spread).with_bias(mesh, change, _OF_SLOPES)
+    sd = Deviations(found, lost, none, error, spread, back)
+    return sd.with_bias(mesh, change, _OF_SLOPES)
 
 
 def contradicted(

@@ -404,7 +404,7 @@ class _Measurement:
             )
         return NodalResult(
             mesh=self.body.mesh,
-            displacement=self.u.reshape(-1, 2),
+            displacement=self.u.reshape(-1, 2) + sd.taken,
             standard_deviation=np.hypot(sd.by_noise, sd.bias),
             noise_deviation=sd.by_noise,
             gradient_covariance=sd.gradient,

@@ -23,12 +23,10 @@ M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the mo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import bsr_array, csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
@@ -74,19 +72,9 @@ class NodalPattern:
 
     def matrix(self, parts: FloatArray) -> csr_array:
         """(2 n, 2 n) of nodal parts xx, xy, yy (3, q)."""
-        n, (indptr, indices) = self.indptr.size - 1, self._of_components
-        data = np.empty(indices.size)
-        _interleave(self.indptr, parts, data)
-        return csr_array((data, indices, indptr), shape=(2 * n, 2 * n))
-
-    @cached_property
-    def _of_components(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Compressed rows of both components of every node."""
-        indptr = np.concatenate([[0], np.cumsum(2 * np.repeat(np.diff(self.indptr), 2))])
-        own = np.repeat(np.arange(2 * (self.indptr.size - 1)), np.diff(indptr))
-        neighbour, component = np.divmod(np.arange(own.size) - indptr[own], 2)
-        indices = 2 * self.indices[self.indptr[own // 2] + neighbour] + component
-        return indptr.astype(np.int32), indices.astype(np.int32)
+        xx, xy, yy = parts
+        blocks = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        return bsr_array((blocks, self.indices, self.indptr)).tocsr()
 
 
 @compiled()
@@ -98,16 +86,6 @@ def _scatter(indptr: Any, indices: Any, nodes: Any, blocks: Any, data: Any) -> N
                 q = low + np.searchsorted(indices[low:high], nodes[e, b])
                 for k in range(data.shape[0]):
                     data[k, q] += blocks[e, k, a, b]
-
-
-@compiled()
-def _interleave(indptr: Any, parts: Any, data: Any) -> None:
-    to = 0
-    for i in range(indptr.size - 1):
-        for c in range(2):
-            for q in range(indptr[i], indptr[i + 1]):
-                data[to], data[to + 1] = parts[c, q], parts[c + 1, q]
-                to += 2
 
 
 def interior_sides(cells: IntArray) -> IntArray:
