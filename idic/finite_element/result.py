@@ -240,7 +240,7 @@ def _beside(mesh: Mesh, grid: PixelGrid, located: Located) -> tuple[NDArray[Any]
     distance, nearest = ndimage.distance_transform_edt(~located.mask, return_indices=True)
     rows, cols = np.nonzero((distance > 0.0) & (distance <= _BEYOND_PX))
     element = located.element[tuple(nearest[:, rows, cols])]
-    xi = _local_coordinates(mesh, element, np.stack(grid.to_mm(rows, cols), axis=1))
+    xi = local_coordinates(mesh, element, np.stack(grid.to_mm(rows, cols), axis=1))
     return rows, cols, mesh.cells[element], shape_functions(mesh.element, xi)
 
 
@@ -253,7 +253,7 @@ def _continue(beside: tuple[NDArray[Any], ...], nodal: FloatArray, values: Float
     values[:, rows, cols] = np.clip(found, own.min(axis=1) - reach, own.max(axis=1) + reach).T
 
 
-def _local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
+def local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
     """(k, 2) of points (k, 2) [mm] in elements (k,) that they are beside."""
     x = mesh.nodes[mesh.cells[element]]
     xi: FloatArray = np.full((element.size, 2), 1.0 / 3.0)

@@ -32,7 +32,8 @@ def cases(
         print(case_text(name), end="")
         return
     commands = {"experiment": "run", "lattice": "bloch, modes", "homogenization": "homogenize"}
-    for kind, command in {**commands, "images": "harvest", "study": "study"}.items():
+    commands |= {"unknowns": "identify", "images": "harvest", "study": "study"}
+    for kind, command in commands.items():
         for shipped, title in shipped_cases(kind).items():
             print(f"{shipped:18}{command:14}{title}")
 

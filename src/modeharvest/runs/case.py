@@ -32,6 +32,7 @@ from modeharvest.util.typed import CHECKS, described, made, nearest, require_typ
 _SHIPPED = resources.files("modeharvest") / "cases"
 _KINDS = {
     "homogenization": ("a homogenized specimen", "modeharvest homogenize {}", "paper-homogenized"),
+    "unknowns": ("an identification", "modeharvest identify {}", "identify-twin"),
     "lattice": (
         "an infinite lattice",
         "modeharvest modes {} --out DIR', or 'modeharvest bloch {}",

@@ -1,0 +1,359 @@
+"""Integrated DIC in the full sense: the unknowns are parameters of a finite-element model.
+
+Minimises one cost in natural weights: grey levels by the camera's noise, displacements of another
+measurement by theirs, forces by the load cell's noise, nominal strains and priors by their own. The
+model gives nodal displacements u(p) on its mesh with their sensitivities. Source: Neggers, Allix,
+Hild & Roux, Arch. Comput. Methods Eng. 25 (2018) 533-573, doi 10.1007/s11831-016-9181-z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from modeharvest.idic.finite_element.observed import ImageData, StateData, Sums
+from modeharvest.idic.solver.assembly import NormalEquations
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, minimise
+from modeharvest.idic.solver.pyramid import FULL, Level
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.scaled_eigen import ScaledEigen
+
+if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
+    from modeharvest.fem.path.parametric import ParametricState as ModelState
+
+LEVELS = (Level(2, 3.0), Level(2, 1.5), FULL)
+"""Of the images, from coarse to fine."""
+_COARSE = GaussNewtonOptions(tolerance_px=2e-2, max_iterations=20)
+_FINE = GaussNewtonOptions(tolerance_px=1e-4, max_iterations=30)
+_FORCE_PX = 0.01
+"""A change of a force by its standard deviation counts as this in the length of a step [px]."""
+_ROUNDS = 4  # of steps with a finer mesh's residual, at most
+_SETTLED = 0.1  # standard errors, rms: of the last of them
+_UNLIKE = 1.5  # times what noise alone makes: a residual that says so
+_LARGE = 0.2
+"""Relative standard deviation of a combination of unknowns beyond which words say so."""
+_PART = 0.3
+"""Of a unit eigenvector: which unknowns a combination is of."""
+
+
+Model = Callable[[FloatArray], "Sequence[ModelState]"]
+"""The states for values of the unknowns (k,); InputError where there are none."""
+
+
+class FinerMesh(NamedTuple):
+    """What the same states are on a finer mesh."""
+
+    states: Callable[[FloatArray], Sequence[tuple[FloatArray, float]]]
+    """For values of the unknowns (k,): u (n, 2) at the model's own nodes [mm], force [N/mm]."""
+    ratio: float
+    """Of its elements' size to that of the model's own [-]."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A parameter to be identified; InputError if start, bounds and prior make no sense."""
+
+    start: float
+    bounds: tuple[float, float]
+    prior_sd: float | None = None
+    """Standard deviation of what is known beforehand, about the start; None for nothing."""
+
+    def __post_init__(self) -> None:
+        low, high = self.bounds
+        if not low < self.start < high:
+            raise InputError(
+                f"expected bounds [low, high] with the start between them, got a start of "
+                f"{self.start:g} and bounds of [{low:g}, {high:g}]"
+            )
+        if self.prior_sd is not None and not self.prior_sd > 0.0:
+            raise InputError(f"expected a prior_sd above 0, got {self.prior_sd:g}")
+
+    def scale(self, value: float) -> float:
+        """What changes of it are compared with: itself, or its bounds' distance if it may be 0."""
+        low, high = self.bounds
+        return abs(value) if low * high > 0.0 else 0.5 * (high - low)
+
+
+@dataclass(frozen=True, eq=False)
+class Scalar:
+    """A reading of one number of each state: forces [N/mm] or nominal strains [-]."""
+
+    values: FloatArray
+    sd: float
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """Parameters of a model as the data have them."""
+
+    unknowns: dict[str, Unknown]
+    values: FloatArray
+    """(k,) in the order of the unknowns."""
+    covariance: FloatArray
+    """(k, k) by noise: the inverse of the normal matrix of all data."""
+    covariance_with_model_error: FloatArray
+    """(k, k) by what the residual is, from part to part of the body, in place of its noise; that of
+    forces and strains at least their noise."""
+    minimum: Minimum
+    states: list[ModelState]
+    sums: list[Sums]
+    """Of the states, which are those of ``minimum.unknowns``."""
+    evaluations: int
+    """How often the model was solved."""
+    mesh_error: FloatArray
+    """(k,) taken for what the finer mesh leaves, and added to the values: from how far it moved
+    them, as errors go with the square of the elements' size; 0 where there was no finer mesh."""
+    forces: Scalar | None = None
+
+    @property
+    def sd(self) -> FloatArray:
+        """(k,) standard deviations by noise; infinite where nothing determines an unknown."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def sd_with_model_error(self) -> FloatArray:
+        """(k,) by noise or by the residual, whichever is larger, and by the mesh."""
+        variance = np.maximum(np.diag(self.covariance_with_model_error), np.diag(self.covariance))
+        return np.asarray(np.hypot(np.sqrt(variance), self.mesh_error))
+
+    @property
+    def correlations(self) -> FloatArray:
+        """(k, k) by noise [-]."""
+        return np.asarray(self.covariance / np.outer(self.sd, self.sd))
+
+    @property
+    def force_sd(self) -> FloatArray:
+        """(states,) of the model's forces by the parameters' covariance with model error [N/mm]."""
+        J = np.array([state.force_by for state in self.states])
+        variance = np.einsum("sj,jk,sk->s", J, self.covariance_with_model_error, J)
+        return np.asarray(np.sqrt(variance))
+
+    @property
+    def statements(self) -> tuple[str, ...]:
+        """What the data don't determine, and which unknowns are at their bounds, in words."""
+        names, scales = list(self.unknowns), self._scales
+        found = []
+        for name, unknown, value in zip(names, self.unknowns.values(), self.values, strict=True):
+            low, high = unknown.bounds
+            if min(value - low, high - value) < 1e-3 * (high - low):
+                found.append(
+                    f"{name} is at its bound: the data may want it beyond [{low:g}, {high:g}]"
+                )
+        for state, share in zip(self.states, self.sums, strict=False):
+            if share.residual > _UNLIKE * share.expected:
+                found.append(
+                    f"at {100 * state.strain:.4g} % the residual is {share.residual:.3g}, "
+                    f"{share.residual / share.expected:.2g} times what noise makes: the model, its "
+                    "branch or its mesh is not the specimen's, or this is a local minimum"
+                )
+        H = self.minimum.equations.matrix * np.outer(scales, scales)
+        squares, vectors = np.linalg.eigh(H)
+        with np.errstate(divide="ignore"):
+            sizes = 1.0 / np.sqrt(np.maximum(squares, 0.0))
+        hint = "" if self.forces is not None else ": add a force"
+        for size, vector in zip(sizes, vectors.T, strict=True):
+            if size < _LARGE:
+                continue
+            own = [k for k in np.argsort(-abs(vector)) if abs(vector[k]) > _PART]
+            vector = vector * np.sign(vector[own[0]])
+            how = "nothing determines it" if size > 1e3 else f"known to {100 * size:.2g} %"
+            if len(own) == 1:
+                found.append(f"{names[own[0]]} is hardly determined ({how}){hint}")
+                continue
+            parts = ", ".join(f"{vector[k]:+.2f} {names[k]}" for k in own)
+            found.append(
+                f"{' and '.join(names[k] for k in sorted(own))} are determined only in other "
+                f"combinations than their relative changes ({parts}) together ({how}){hint}"
+            )
+        return tuple(found)
+
+    @property
+    def _scales(self) -> FloatArray:
+        pairs = zip(self.unknowns.values(), self.values, strict=True)
+        return np.array([unknown.scale(value) for unknown, value in pairs])
+
+
+@dataclass(eq=False)
+class _Cost:
+    """The cost and its normal equations, of the data of one level."""
+
+    model: Model
+    data: Sequence[StateData | None]
+    unknowns: dict[str, Unknown]
+    forces: Scalar | None
+    strains: Scalar | None
+    by_amplitude: BoolArray
+    px: float
+    evaluations: int = 0
+    _states: dict[bytes, list[ModelState]] = field(default_factory=dict)
+
+    def states(self, values: FloatArray) -> list[ModelState]:
+        """The model's, of which the last few are kept."""
+        key = values.tobytes()
+        if key not in self._states:
+            self.evaluations += 1
+            self._states = {**dict(list(self._states.items())[-2:]), key: list(self.model(values))}
+        return self._states[key]
+
+    def shares(self, states: Sequence[ModelState]) -> list[Sums]:
+        """Of the states with images or displacements."""
+        return [data.sums(s) for data, s in zip(self.data, states, strict=True) if data]
+
+    def scalars(self, states: Sequence[ModelState], values: FloatArray) -> list[tuple[float, Any]]:
+        """Residuals of forces, strains and priors over their standard deviations, with -dr/dp."""
+        found = list[tuple[float, Any]]()
+        if self.forces is not None:
+            for measured, state in zip(self.forces.values, states, strict=True):
+                if np.isfinite(measured):
+                    r = float(measured - state.force) / self.forces.sd
+                    found.append((r, state.force_by / self.forces.sd))
+        if self.strains is not None:
+            for k in np.flatnonzero(self.by_amplitude):
+                r = float(self.strains.values[k] - states[k].strain) / self.strains.sd
+                found.append((r, states[k].strain_by / self.strains.sd))
+        for k, unknown in enumerate(self.unknowns.values()):
+            if unknown.prior_sd is not None:
+                one = np.eye(len(values))[k] / unknown.prior_sd
+                found.append(((unknown.start - values[k]) / unknown.prior_sd, one))
+        return found
+
+    def equations(self, values: FloatArray, _with_matrix: bool = True) -> NormalEquations:
+        """Of everything; an infinite cost beyond bounds and where the model has no states."""
+        count = len(values)
+        nothing = NormalEquations(np.zeros((count, count)), np.zeros(count), np.inf, 1, 0)
+        bounds = np.array([u.bounds for u in self.unknowns.values()])
+        if np.any(values <= bounds[:, 0]) or np.any(values >= bounds[:, 1]):
+            return nothing
+        try:
+            states = self.states(values)
+        except InputError:
+            if not self._states:
+                raise
+            return nothing
+        return self.equations_at(states, values)
+
+    def equations_at(self, states: Sequence[ModelState], values: FloatArray) -> NormalEquations:
+        """Of everything, with the model's states at these values."""
+        matrix: FloatArray = np.zeros((len(values),) * 2)
+        gradient: FloatArray = np.zeros(len(values))
+        squares, number = 0.0, 0
+        for share in self.shares(states):
+            matrix, gradient = matrix + share.matrix, gradient + share.blocks.sum(axis=0)
+            squares, number = squares + share.squares, number + share.count
+        for r, J in self.scalars(states, values):
+            matrix, gradient = matrix + np.outer(J, J), gradient - r * J
+            squares, number = squares + r**2, number + 1
+        return NormalEquations(matrix, gradient, 0.5 * squares, number, 0)
+
+    def step_length(self, before: FloatArray, after: FloatArray) -> float:
+        """Rms change of the displacements [px], or what changes of forces count as."""
+        states, change = self.states(before), after - before
+        squares = [
+            np.mean(np.tensordot(change, s.displacement_by, 1) ** 2) / self.px**2 for s in states
+        ]
+        moved = float(np.sqrt(2.0 * np.mean(squares)))
+        if self.forces is not None:
+            sizes = [abs(float(s.force_by @ change)) / self.forces.sd for s in states]
+            moved = max(moved, _FORCE_PX * max(sizes))
+        return moved
+
+
+def identify(
+    model: Model,
+    data: Sequence[StateData | None],
+    unknowns: dict[str, Unknown],
+    *,
+    pixel_size: float,
+    forces: Scalar | None = None,
+    strains: Scalar | None = None,
+    levels: Sequence[Level] = LEVELS,
+    finer: FinerMesh | None = None,
+    progress: Progress = silent,
+) -> Identified:
+    """Find the unknowns for which a model's states look like the data.
+
+    model : gives as many states as there are data, with derivatives by the unknowns in their order.
+    data : images or displacements of each state, or None where there is only a force.
+    pixel_size : lengths of steps are counted in it [mm].
+    forces : readings [N/mm], NaN where there is none.
+    strains : readings of nominal strains; they count for states that are found by an amplitude.
+    finer : a finer mesh, whose residual the last steps take, with this one's sensitivities; from
+        both the values are extrapolated to elements of no size (Richardson).
+    InputError if the model has no states at the start.
+    """
+    if not any(data) and forces is None:
+        raise InputError("expected images, displacements or forces to identify from, got none")
+    names = list(unknowns)
+    by_amplitude = np.array([f"amplitude[{k}]" in names for k in range(len(data))])
+    cost = _Cost(model, data, unknowns, forces, strains, by_amplitude, pixel_size)
+    values = np.array([unknown.start for unknown in unknowns.values()])
+    stages = list(levels) if any(isinstance(d, ImageData) for d in data) else [FULL]
+    found: Minimum | None = None
+    for number, level in enumerate(stages):
+        progress(number, len(stages), "identify")
+        for part, state in zip(data, cost.states(values), strict=True):
+            if part is not None:
+                part.prepare(level, state)
+        how = _FINE if level == stages[-1] else _COARSE
+        found = minimise(cost.equations, cost.step_length, values, how, level.factor)
+        values = found.unknowns
+    assert found is not None
+    progress(len(stages), len(stages), "identify")
+    for part, state in zip(data, cost.states(values), strict=True):
+        if part is not None:
+            part.prepare(FULL, state)  # weights of the state that was found
+    states, off = cost.states(values), np.zeros_like(values)
+    if finer is not None:
+        begin = values
+        values, states = _finished(cost, values, finer)
+        off = (values - begin) * finer.ratio**2 / (1.0 - finer.ratio**2)
+    result = _assessed(cost, values, states, replace(found, unknowns=values), off)
+    return replace(result, values=values + off)
+
+
+def _finished(
+    cost: _Cost, values: FloatArray, finer: FinerMesh
+) -> tuple[FloatArray, list[ModelState]]:
+    """Values and states by Gauss-Newton steps with a finer mesh's residual: no sensitivities."""
+    bounds = np.array([u.bounds for u in cost.unknowns.values()])
+    for _ in range(_ROUNDS):
+        states = [
+            replace(state, displacement=u, force=force)
+            for state, (u, force) in zip(cost.states(values), finer.states(values), strict=True)
+        ]
+        here = cost.equations_at(states, values)
+        eigen = ScaledEigen.of(here.matrix)
+        step = -eigen.solve(here.gradient)
+        if float(step @ here.matrix @ step) < _SETTLED**2 * step.size:
+            break
+        # Halfway to a bound at most, as from inside.
+        room = np.where(step > 0.0, bounds[:, 1] - values, values - bounds[:, 0])
+        values = values + np.clip(step, -0.5 * room, 0.5 * room)
+    return values, states
+
+
+def _assessed(
+    cost: _Cost, values: FloatArray, states: list[ModelState], found: Minimum, off: FloatArray
+) -> Identified:
+    """The result, with its covariances: by noise, and by the residual from block to block."""
+    found = replace(found, equations=cost.equations_at(states, values))
+    inverse = ScaledEigen.of(found.equations.matrix).inverse()
+    shares = cost.shares(states)
+    scatter = np.zeros_like(inverse)
+    for share in shares:
+        scatter += share.blocks.T @ share.blocks
+    for r, J in cost.scalars(states, values):
+        scatter += max(1.0, r**2) * np.outer(J, J)
+    known = np.isfinite(np.diag(inverse))
+    half = np.where(np.outer(known, known), inverse, 0.0)
+    with_error = half @ scatter @ half
+    with_error[~known, ~known] = np.inf
+    return Identified(
+        cost.unknowns, values, inverse, with_error, found, states, shares, cost.evaluations, off,
+        cost.forces,
+    )  # fmt: skip

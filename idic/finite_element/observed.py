@@ -1,0 +1,199 @@
+"""What is observed of a state, images or displacements, against a model's nodal displacements.
+
+A pixel x in an element has J = grad g(x + u) . sum N_a S_a, with the sensitivities S = du/dp of the
+nodes to a model's parameters. So their normal equations are those of the nodes, projected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.fields import determinant, element_gradients
+from modeharvest.idic.finite_element.pixels import (
+    MeshPixels,
+    NodalEquations,
+    images_on,
+    normal_equations,
+)
+from modeharvest.idic.finite_element.result import local_coordinates
+from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer
+from modeharvest.idic.solver.pyramid import FULL, Level
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.isoparametric import locate, locate_points
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.elements import shape_functions
+from modeharvest.util.errors import InputError
+
+if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
+    from modeharvest.fem.path.parametric import ParametricState as ModelState
+
+_EDGE_PX = 3
+"""Left out at edges: between them and the material the deformed image's spline reads background."""
+_LEAST_DET = 0.1
+_MOST_NOISE = 0.9  # of the mean square slope
+_ALONG = 8
+"""Parts of the body along its length whose residuals are taken for independent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """A state's share of the normal equations of the k unknowns, by the data's weights."""
+
+    blocks: FloatArray
+    """(b, k): -J'r of parts of the data that are far from each other."""
+    matrix: FloatArray
+    squares: float
+    count: int
+    residual: float
+    """Rms of what is compared: grey levels, or mm per component."""
+    expected: float
+    """The same by noise alone."""
+
+
+class StateData(Protocol):
+    """What is known of one state apart from force and strain."""
+
+    def prepare(self, level: Level, state: ModelState) -> None:
+        """Have the data of a level, weighted as the model's state asks for."""
+
+    def sums(self, state: ModelState) -> Sums:
+        """The share of the normal equations at the model's state."""
+
+
+class ImageData:
+    """A pair of images of a state, compared on the pixels that the model's mesh covers."""
+
+    def __init__(self, pair: ImagePair, pixels: MeshPixels, noise: ImageNoise) -> None:
+        mesh, grid = pixels.mesh, pair.grid
+        covered = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the model").mask
+        self.pair = replace(pair, mask=covered & pair.masks[0])
+        self.pixels, self.noise = pixels, noise
+        self.order = spline_order(speckle_size(pair.reference, self.pair.mask))
+        self.block = _blocks(mesh)
+
+    def prepare(self, level: Level, state: ModelState) -> None:
+        """Images of a level; on a coarse one what the residual is weighs it, not its noise."""
+        order = self.order if level == FULL else 5
+        self._images = images_on(self.pair, level, _EDGE_PX, order)
+        images = self._images
+        self._own = self.pixels.on(images.grid, images.mask, images.reference)
+        self._weight, self._level = 1.0, level
+        sums = self._nodal(state)
+        if sums.pixels == 0:
+            raise InputError("expected pixels of the model's mesh in both images, got none")
+        if level != FULL:
+            # Blurred pixels are alike: as many count as there are independent ones.
+            self._expected = sums.rms
+            self._weight = 1.0 / (sums.rms**2 * max(1.0, 4.0 * np.pi * level.blur**2))
+            return
+        mesh, u, px = self.pixels.mesh, state.displacement, self.pair.grid.pixel_size
+        gradients = element_gradients(mesh, u)
+        det = np.maximum(determinant(np.eye(2) + gradients.mean(axis=1)), _LEAST_DET)
+        transfer = NoiseTransfer.at(u[mesh.cells].mean(axis=1) / px, det, self.order)
+        f, g = self.noise.reference**2, self.noise.deformed**2
+        slopes = float(sums.blocks[:, [0, 2]].sum()) / sums.pixels  # mean of |grad g|^2
+        share = min(2.0 * g * transfer.slope / px**2 / slopes, _MOST_NOISE)
+        self._expected = float(np.sqrt(f + g * transfer.value))
+        self._weight = (1.0 - share) ** 2 / (f + g * transfer.density * (1.0 - share))
+
+    def _nodal(self, state: ModelState) -> NodalEquations:
+        return normal_equations(self._own, self.pixels.mesh, self._images, state.displacement)
+
+    def sums(self, state: ModelState) -> Sums:
+        """Projected from those of the nodes' displacements."""
+        nodal, cells = self._nodal(state), self.pixels.mesh.cells
+        S = state.displacement_by[:, cells]  # (k, m, 6, 2)
+        parts = -np.einsum("kmai,mai->mk", S, nodal.gradient)
+        blocks = np.zeros((self.block.max() + 1, len(S)))
+        np.add.at(blocks, self.block, parts)
+        xx, xy, yy = np.moveaxis(nodal.blocks, 1, 0)
+        x, y = S[..., 0], S[..., 1]
+        left = np.einsum("mab,kmb->kma", xx, x) + np.einsum("mab,kmb->kma", xy, y)
+        right = np.einsum("mba,kmb->kma", xy, x) + np.einsum("mab,kmb->kma", yy, y)
+        matrix = np.einsum("jma,kma->jk", x, left) + np.einsum("jma,kma->jk", y, right)
+        w = self._weight
+        return Sums(w * blocks, w * 0.5 * (matrix + matrix.T), w * nodal.square_sum, nodal.pixels,
+                    nodal.rms, self._expected)  # fmt: skip
+
+    def residual(self, state: ModelState) -> FloatArray:
+        """(rows, cols) f - g(x + u) [grey levels] of the pixels compared; NaN elsewhere."""
+        own, mesh = self._own, self.pixels.mesh
+        found = np.full(self._images.grid.shape, np.nan)
+        element = np.repeat(np.arange(len(mesh.cells)), np.diff(own.start))
+        N = shape_functions("T6", own.xi.T.astype(np.float64))
+        u = np.einsum("pa,pai->pi", N, state.displacement[mesh.cells[element]])
+        px = self._images.grid.pixel_size
+        g, *_ = self._images.deformed.sample(own.row - u[:, 1] / px, own.col + u[:, 0] / px)
+        found[own.row, own.col] = own.grey - g
+        return found
+
+
+class FieldData:
+    """Displacements of a state at points, by any code.
+
+    points, u : (p, 2) in the reference's frame [mm]; points beside the mesh are left out.
+    sd : standard deviation of each component [mm], one for all or (p, 2).
+    """
+
+    def __init__(
+        self, points: FloatArray, u: FloatArray, sd: FloatArray | float, mesh: Mesh
+    ) -> None:
+        element, xi = _located(mesh, points)
+        inside = (element >= 0) & np.isfinite(u).all(axis=1)
+        if not inside.any():
+            raise InputError("expected displacements at points of the specimen, got none there")
+        self._nodes = mesh.cells[element[inside]]
+        self._N = shape_functions(mesh.element, xi[inside])
+        self._u = np.asarray(u, np.float64)[inside]
+        self._w = 1.0 / np.broadcast_to(np.asarray(sd, np.float64), u.shape)[inside] ** 2
+        self._block = _blocks(mesh)[element[inside]]
+
+    def prepare(self, level: Level, state: ModelState) -> None:
+        """Nothing: displacements have no levels."""
+
+    def sums(self, state: ModelState) -> Sums:
+        """By differences of displacements at the points."""
+        left = self._u - np.einsum("pa,pai->pi", self._N, state.displacement[self._nodes])
+        J = np.einsum("pa,kpai->kpi", self._N, state.displacement_by[:, self._nodes])
+        blocks = np.zeros((self._block.max() + 1, len(J)))
+        np.add.at(blocks, self._block, -np.einsum("kpi,pi->pk", J, self._w * left))
+        matrix = np.einsum("jpi,kpi->jk", J, self._w * J)
+        expected = float(np.sqrt(np.mean(1.0 / self._w)))
+        return Sums(blocks, matrix, float(np.sum(self._w * left**2)), left.size,
+                    float(np.sqrt(np.mean(left**2))), expected)  # fmt: skip
+
+
+def _located(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    """(p,) elements and (p, 2) local coordinates of points (p, 2) [mm]; -1 beside the mesh."""
+    grid = PixelGrid.centred(3, 3, float(np.ptp(mesh.nodes[:, 0])) / 1000.0)
+    row, col = grid.to_px(points[:, 0], points[:, 1])
+    found = locate_points(mesh.nodes, mesh.cells, mesh.element, grid, row[None], col[None])
+    return found.element[0].astype(np.int64), found.xi[0].copy()
+
+
+def nodal_values(mesh: Mesh, nodal: FloatArray, points: FloatArray) -> FloatArray:
+    """(p, c) a mesh's nodal fields (n, c) at points (p, 2), just beside the mesh continued."""
+    element, xi = _located(mesh, points)
+    beside = np.flatnonzero(element < 0)
+    if beside.size:  # by edges of holes: parabolas through other points of the circle
+        middle = mesh.nodes[mesh.cells].mean(axis=1)
+        element[beside] = KDTree(middle).query(points[beside])[1]
+        xi[beside] = local_coordinates(mesh, element[beside], points[beside])
+    N = shape_functions(mesh.element, xi)
+    return np.asarray(np.einsum("pa,pac->pc", N, nodal[mesh.cells[element]]))
+
+
+def _blocks(mesh: Mesh) -> IntArray:
+    """(m,) number of the part of the body that each element is in."""
+    middle = mesh.nodes[mesh.cells].mean(axis=1) - mesh.nodes.min(axis=0)
+    size = np.ptp(mesh.nodes[:, 0]) / _ALONG
+    place = np.floor(middle / size).astype(np.int64)
+    part = place[:, 0] * (1 + place[:, 1].max()) + place[:, 1]
+    return np.asarray(np.unique(part, return_inverse=True)[1], np.int64)

@@ -1,0 +1,173 @@
+"""modeharvest identify: a twin from its own images to its report, and what can't be used."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from documented_keys import undocumented
+
+from modeharvest.idic.local.field import LocalField, write_field
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.photographs.files import read_image, write_image
+from modeharvest.report.identification import identification_report
+from modeharvest.runs.case import Case
+from modeharvest.runs.identification import IdentificationCase, run_identification
+from modeharvest.util.errors import InputError
+
+SPECIMEN = {"holes_x": 4, "holes_y": 2, "diameter": 1.5, "bulk_x": 0.9, "bulk_y": 0.4}
+BEFORE: dict[str, Any] = {
+    "title": "small",
+    "experiment": {"specimen": SPECIMEN, "strains": [0.03, 0.05], "mesh_size": 0.55},
+    "unknowns": {"moduli[0]": {"start": 2.4, "bounds": [0.1, 10.0]},
+                 "kappa": {"start": 2.7, "bounds": [0.5, 50.0]},
+                 "tilt": {"start": 0.0, "bounds": [-0.5, 0.5]}},
+    "finer_mesh_size": 0.5,
+    "twin": {"mesh_size": 0.5, "tilt": 0.1, "force_sd": 0.002, "force_seed": 3},
+    "imaging": {"pixel_size": 0.05, "margin_px": 10,
+                "sensor": {"read_noise": 0.01, "read_seed": 5}},
+}  # fmt: skip
+FORCES = {"forces_N_per_mm": [0.2, 0.3], "force_sd": 0.002}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("identified")
+    return folder, run_identification(BEFORE, folder)
+
+
+def require_truth(summary: dict[str, Any]) -> None:
+    for p in summary["parameters"]:
+        assert abs(p["value"] - p["true"]) < 4.0 * p["sd_with_model_error"]
+
+
+@pytest.mark.dolfinx
+def test_a_twin_is_identified_from_its_own_images(run: tuple[Path, dict[str, Any]]) -> None:
+    folder, summary = run
+    assert summary["outcome"] == "converged"
+    require_truth(summary)
+    units = {p["name"]: p["unit"] for p in summary["parameters"]}
+    assert units == {"moduli[0]": "MPa", "kappa": "MPa", "tilt": "rad"}
+    for p in summary["parameters"]:  # a factor of two off, and now a few percent
+        assert p["sd_with_model_error"] < 0.2 * max(abs(p["start"]), 0.2)
+    for state in summary["states"]:
+        assert state["residual_rms"] == pytest.approx(state["residual_noise"], rel=0.05)
+    assert np.allclose(np.diag(summary["correlations"]), 1.0)
+    assert json.loads((folder / "summary.json").read_text("utf-8")) == summary
+    page = (folder / "report.html").read_text("utf-8")
+    assert 'id="residual-2"' in page
+    report = identification_report(summary)
+    assert [row[0] for row in next(report.tables).rows] == [
+        "moduli[0] [MPa]", "kappa [MPa]", "tilt [rad]",
+    ]  # fmt: skip
+
+
+@pytest.mark.dolfinx
+def test_a_run_is_not_done_twice(run: tuple[Path, dict[str, Any]]) -> None:
+    folder, summary = run
+    made = (folder / "summary.json").stat().st_mtime_ns
+    assert run_identification(BEFORE, folder) == summary
+    assert (folder / "summary.json").stat().st_mtime_ns == made
+
+
+@pytest.mark.dolfinx
+def test_files_of_images_or_of_fields_say_the_same(
+    run: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    """The twin's own photographs, and its exact displacement at every fifth pixel."""
+    folder, summary = run
+    images = ImageSet.read(folder / "images")
+    for k, strain in enumerate(images.strains):
+        record = images.info["snapshots"][k]
+        write_image(tmp_path / f"g{k}.tif", read_image(images.folder / record["camera_image"]))
+        u = images.truth(strain).displacement[::5, ::5]
+        x, y = np.meshgrid(images.grid.x[::5], images.grid.y[::5])
+        inside = np.isfinite(u[..., 0])
+        write_field(tmp_path / f"u{k}.csv", LocalField(x[inside], y[inside], u[inside]))
+    camera = images.info["reference"]["camera_image"]
+    write_image(tmp_path / "f.tif", read_image(images.folder / camera))
+    readings = json.loads((folder / "forces.json").read_text("utf-8"))["forces_N_per_mm"]
+    forces = {"forces_N": [8.0 * F for F in readings], "thickness_mm": 8.0, "force_sd": 0.016}
+    by_data = {
+        "images": {"reference": "f.tif", "deformed": ["g*.tif"], "pixel_size": 0.05, **forces},
+        "fields": {"fields": ["u*.csv"], "field_sd_mm": 1e-3, **forces},
+    }
+    for name, data in by_data.items():
+        tables = {key: value for key, value in BEFORE.items() if key not in ("twin", "imaging")}
+        case = IdentificationCase.model_validate(tables | {"data": data})
+        case._base = tmp_path
+        found = run_identification(case, tmp_path / name)
+        for p, q in zip(found["parameters"], summary["parameters"], strict=True):
+            assert p["true"] is None
+            assert abs(p["value"] - q["true"]) < 4.0 * p["sd_with_model_error"]
+
+
+@pytest.mark.dolfinx
+def test_every_key_of_the_summary_is_documented(run: tuple[Path, dict[str, Any]]) -> None:
+    assert undocumented(run[1], "identification.md") == set()
+
+
+def test_the_shipped_case_is_one() -> None:
+    case = IdentificationCase.read("identify-twin")
+    assert case.twin is not None
+    assert case.twin.value("exponents[0]") == 3.0
+    with pytest.raises(InputError, match="run 'modeharvest identify identify-twin"):
+        Case.read("identify-twin")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"unknowns": {}}, "expected at least one, got none"),
+        ({"unknowns": {"kappa": {"start": 1.0, "bounds": [2.0, 3.0]}}},
+         "start between them, got a start of 1 and bounds of [2, 3]"),
+        ({"unknowns": {"kappa": {"start": 1.0}}}, "expected unknowns.kappa.bounds, got none"),
+        ({"experiment": {"strains": [0.05, 0.03]}}, "expected ascending positive ones"),
+        ({"data": {"reference": "f.tif", "deformed": ["g.tif", "h.tif"]}},
+         "expected a pixel_size [mm/px] for images"),
+        ({"data": {"fields": ["a.csv", "b.csv"]}}, "expected field_sd_mm"),
+        ({"data": {}}, "expected images (reference and deformed) or fields, got neither"),
+        ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, "forces_N": [1.0, 2.0],
+                   "force_sd": 0.1}}, "expected thickness_mm with forces_N"),
+        ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, "forces_N_per_mm": [1.0],
+                   "force_sd": 0.1}}, "as many forces_N_per_mm as strains (2), got 1"),
+        ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, **FORCES, "force_sd": None}},
+         "expected force_sd with forces"),
+        ({"twin": None}, "expected a table [data] or a table [twin]"),
+    ],
+)  # fmt: skip
+def test_a_case_that_makes_no_sense_is_refused_in_one_line(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    tables = BEFORE | change
+    if "data" in change:
+        del tables["twin"]
+    tables = {name: value for name, value in tables.items() if value is not None}
+    path = tmp_path / "case.json"
+    with pytest.raises(InputError, match=re.escape(message)) as refused:
+        IdentificationCase.of(made(tables, path))
+    assert "\n" not in str(refused.value)
+
+
+def made(tables: dict[str, Any], path: Path) -> IdentificationCase:
+    from modeharvest.runs.case import checked
+
+    return checked(IdentificationCase, tables, path)
+
+
+@pytest.mark.dolfinx
+def test_images_of_another_number_are_refused(tmp_path: Path) -> None:
+    tables = {name: value for name, value in BEFORE.items() if name != "twin"}
+    data = {"reference": "f.tif", "deformed": ["g.tif"], "pixel_size": 0.05}
+    for name in ("f", "g"):
+        write_image(tmp_path / f"{name}.tif", np.zeros((20, 20), np.uint8))
+    fields = {"fields": ["f.tif"], "field_sd_mm": 1.0}
+    for table, what in ((data, "deformed images"), (fields, "fields")):
+        case = made(tables | {"data": table}, tmp_path)
+        case._base = tmp_path
+        with pytest.raises(InputError, match=rf"as many {what} as strains \(2\), got 1"):
+            run_identification(case, tmp_path / "out")

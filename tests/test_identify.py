@@ -1,0 +1,209 @@
+"""Parameters identified from images, fields and forces: a model of a closed form.
+
+A plate is stretched along x by a and, by b a, along y, under a force c a. Images are sums of waves,
+exact at every point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.identify import (
+    FinerMesh,
+    Identified,
+    Scalar,
+    Unknown,
+    identify,
+)
+from modeharvest.idic.finite_element.mesh import quadratic
+from modeharvest.idic.finite_element.observed import FieldData, ImageData, nodal_values
+from modeharvest.idic.finite_element.pixels import MeshPixels
+from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.idic.solver.pyramid import FULL
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.util.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+
+def plate(width: float, height: float, n: int, m: int) -> Mesh:
+    """A rectangle about the origin of 2 n m triangles."""
+    x, y = np.meshgrid(
+        np.linspace(-0.5, 0.5, n + 1) * width, np.linspace(-0.5, 0.5, m + 1) * height
+    )
+    a = (np.arange(m)[:, None] * (n + 1) + np.arange(n)).ravel()
+    corners = [[a, a + 1, a + n + 2], [a, a + n + 2, a + n + 1]]
+    return quadratic(Mesh(np.stack([x.ravel(), y.ravel()], 1), np.hstack(corners).T, "T3"))
+
+
+MESH = plate(4.0, 3.0, 5, 4)
+GRID = PixelGrid.centred(90, 116, 0.04)
+TRUE = np.array([0.05, -0.6, 2.0])
+NOISE = 0.01
+LOADS = (1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class State:
+    strain: float
+    displacement: FloatArray
+    force: float
+    displacement_by: FloatArray
+    force_by: FloatArray
+    strain_by: FloatArray
+
+
+def model(values: FloatArray) -> list[State]:
+    a, b, c = values
+    x, y = MESH.nodes.T
+    none = np.zeros_like(x)
+    return [
+        State(
+            e * a, e * a * np.stack([x, b * y], axis=1), e * a * c,
+            np.stack([e * np.stack([x, b * y], 1), e * a * np.stack([none, y], 1), 0 * MESH.nodes]),
+            np.array([e * c, 0.0, e * a]), np.array([e, 0.0, 0.0]),
+        )
+        for e in LOADS
+    ]  # fmt: skip
+
+
+def pattern(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Waves of 7 to 20 px."""
+    rng = np.random.default_rng(0)
+    k, phase = 2 * np.pi / rng.uniform(0.28, 0.8, 60), rng.uniform(0, 2 * np.pi, (2, 60))
+    waves = np.cos(
+        k * (np.cos(phase[0]) * x[..., None] + np.sin(phase[0]) * y[..., None]) + phase[1]
+    )
+    return np.asarray(0.5 + 0.03 * waves.sum(axis=-1))
+
+
+def images(seed: int, values: FloatArray = TRUE) -> list[ImageData]:
+    rng, pixels = np.random.default_rng(seed), MeshPixels(MESH)
+    x, y = np.meshgrid(GRID.x, GRID.y)
+
+    def noisy(image: FloatArray) -> FloatArray:
+        return image + rng.normal(0.0, NOISE, GRID.shape)
+
+    f = noisy(pattern(x, y))
+    moved = [
+        noisy(pattern(x / (1 + e * values[0]), y / (1 + e * values[0] * values[1]))) for e in LOADS
+    ]
+    noise = ImageNoise(NOISE, NOISE)
+    return [ImageData(ImagePair(f, g, GRID), pixels, noise) for g in moved]  # type: ignore[arg-type]
+
+
+UNKNOWNS = {
+    "a": Unknown(0.025, (0.001, 0.5)),
+    "b": Unknown(-0.3, (-2.0, 2.0)),
+    "c": Unknown(1.0, (0.1, 9.0)),
+}
+FORCES = Scalar(np.array([e * TRUE[0] * TRUE[2] for e in LOADS]), 1e-3)
+
+
+def found_from(seed: int, **more: object) -> Identified:
+    rng = np.random.default_rng(1000 + seed)
+    readings = Scalar(FORCES.values + rng.normal(0.0, FORCES.sd, 2), FORCES.sd)
+    given = {"forces": readings, "pixel_size": GRID.pixel_size, **more}
+    return identify(model, images(seed), UNKNOWNS, **given)  # type: ignore[arg-type]
+
+
+def test_errors_are_what_their_standard_deviations_predict() -> None:
+    """From values off by a factor of two; 12 seeds of 3 parameters: chi squared of 36."""
+    every = []
+    for seed in range(12):
+        found = found_from(seed, levels=(FULL,)) if seed else found_from(seed)
+        off = found.values - TRUE
+        every.append(off @ np.linalg.solve(found.covariance, off))
+        if seed == 0:  # coarse levels lead to the same minimum
+            same = found_from(seed, levels=(FULL,)).values
+            assert np.all(np.abs(found.values - same) < 0.05 * found.sd)
+            assert found.statements == ()
+            for share in found.sums:
+                assert share.residual == pytest.approx(share.expected, rel=0.02)
+    assert 19.0 < sum(every) < 59.0  # 1 % and 99 % of chi squared of 36 degrees
+
+
+def test_the_gradient_is_the_cost_s() -> None:
+    """Where g has no noise: by differences of the cost, which grows with the square of the step."""
+    states = images(0)
+    values = TRUE * [1.02, 1.05, 1.0]
+    for data, k in ((states[1], 1),):
+        data.prepare(FULL, model(values)[k])
+        here = data.sums(model(values)[k])
+        for i, step in enumerate((1e-5, 1e-4)):
+            h = np.eye(3)[i] * step
+            cost = [0.5 * data.sums(model(values + s * h)[k]).squares for s in (1.0, -1.0)]
+            slope = (cost[0] - cost[1]) / (2 * step)
+            assert here.blocks.sum(axis=0)[i] == pytest.approx(slope, rel=1e-3)
+
+
+def test_a_displacement_field_instead_of_images() -> None:
+    rng = np.random.default_rng(0)
+    points, sd = rng.uniform([-2.1, -1.6], [2.1, 1.6], (400, 2)), 1e-3
+    true = [e * TRUE[0] * points * [1.0, TRUE[1]] for e in LOADS]
+    data = [FieldData(points, u + rng.normal(0, sd, u.shape), sd, MESH) for u in true]
+    found = identify(model, data, UNKNOWNS, pixel_size=0.04, forces=FORCES)
+    assert np.all(np.abs(found.values - TRUE) < 4 * found.sd)
+    assert np.all(found.sd[:2] / np.abs(TRUE[:2]) < 0.02)
+    np.testing.assert_allclose(nodal_values(MESH, MESH.nodes, points), points, atol=1e-9)
+
+
+def test_statements_name_what_the_data_do_not_determine() -> None:
+    found = identify(model, images(0), UNKNOWNS, pixel_size=0.04)
+    assert np.isinf(found.sd[2])
+    assert found.statements == ("c is hardly determined (nothing determines it): add a force",)
+    prior = {**UNKNOWNS, "c": Unknown(1.0, (0.1, 9.0), prior_sd=0.1)}
+    with_prior = identify(model, images(0), prior, pixel_size=0.04)
+    assert with_prior.sd[2] == pytest.approx(0.1, rel=1e-6)
+    assert with_prior.statements == ()
+    tight = {**UNKNOWNS, "b": Unknown(-0.3, (-0.5, 0.0))}
+    stopped = identify(model, images(0), tight, pixel_size=0.04, forces=FORCES)
+    assert stopped.statements[0].startswith("b is at its bound: the data may want it beyond [-0.5,")
+
+
+def test_a_wrong_model_widens_the_intervals() -> None:
+    """The specimen is sheared, too, which the model can't do; forces contradict each other."""
+
+    def sheared(values: FloatArray) -> list[State]:
+        return [
+            replace(s, displacement=s.displacement + 4e-3 * np.sin(2 * MESH.nodes[:, ::-1]))
+            for s in model(values)
+        ]
+
+    right = found_from(0, levels=(FULL,))
+    wrong = identify(sheared, images(0), UNKNOWNS, pixel_size=0.04, forces=FORCES)
+    assert np.all(right.sd_with_model_error < 2.0 * right.sd)
+    assert np.all(wrong.sd_with_model_error[:2] > 2.0 * wrong.sd[:2])
+
+
+def test_a_finer_mesh_has_the_last_word() -> None:
+    """Its states here are those of other parameters, which the data then want back.
+
+    Of half the elements' size, it takes three quarters of the error away; the limit does the rest.
+    """
+    shift = np.array([1e-3, 0.01, 0.02])
+
+    def states(values: FloatArray) -> list[tuple[FloatArray, float]]:
+        return [(s.displacement, s.force) for s in model(values + shift)]
+
+    plain = found_from(0, levels=(FULL,))
+    found = found_from(0, levels=(FULL,), finer=FinerMesh(states, 0.5))
+    assert np.all(np.abs(found.minimum.unknowns + shift - plain.values) < 0.2 * plain.sd)
+    assert np.all(np.abs(found.values + 4.0 / 3.0 * shift - plain.values) < 0.2 * plain.sd)
+    assert np.all(np.abs(found.mesh_error + shift / 3.0) < 0.1 * plain.sd)
+    assert np.all(found.sd_with_model_error > np.abs(found.mesh_error))
+
+
+def test_bad_input_is_one_line() -> None:
+    with pytest.raises(InputError, match=r"start between them, got a start of 3 and bounds of \[1"):
+        Unknown(3.0, (1.0, 2.0))
+    with pytest.raises(InputError, match="images, displacements or forces to identify from"):
+        identify(model, [None, None], UNKNOWNS, pixel_size=1.0)
+    with pytest.raises(InputError, match="at points of the specimen, got none there"):
+        FieldData(MESH.nodes + 10.0, MESH.nodes, 1.0, MESH)
