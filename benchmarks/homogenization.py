@@ -11,8 +11,10 @@ docs/homogenization.md, as Markdown:
   ``--picture PNG`` draws the size effect.
 - ``specimen``: the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
 - ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.
-- ``positions``: means over N x N centres of the RVE, spread evenly over a cell, N = 1 to 4, of
-  strips and specimens.
+- ``positions``: means over positions of the RVE that are spread evenly over a cell, of strips and
+  specimens.
+- ``translations``: specimens whose lattice is moved against their bulk edges, and their mean.
+- ``bowing``: where a whole specimen becomes unstable once more, and how.
 - ``flower``: three modes of triangular stacking under equibiaxial load, computed, analytic and
   measured in an image: all branches by energy, against those of the periodic cell.
 - ``loads``: sides, shear and bending: against Bloch waves, and a specimen bent or sheared as it is
@@ -42,6 +44,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.bloch.critical import critical_at, first_critical
@@ -57,7 +60,7 @@ from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, Line
 from modeharvest.fem.lattice.micromorphic.mesh import rectangle_mesh
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.patterns import ModeField, PlaneWaves, rotation_pattern
-from modeharvest.fem.lattice.micromorphic.rve import RVE
+from modeharvest.fem.lattice.micromorphic.rve import RVE, spread_positions
 from modeharvest.fem.lattice.options import (
     CriticalSearch,
     MacroLoading,
@@ -66,7 +69,16 @@ from modeharvest.fem.lattice.options import (
     uniaxial_strain,
 )
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.fem.meshing import SIGNS, MeshBlock, join, mesh_specimen, quarter_cell
+from modeharvest.fem.meshing import (
+    SIGNS,
+    MeshBlock,
+    divisions_of,
+    join,
+    mesh_block,
+    mesh_specimen,
+    quarter_cell,
+    rectangle,
+)
 from modeharvest.fem.path.bifurcation import follow_branch, locate_critical
 from modeharvest.fem.path.continuation import PathFollower
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
@@ -111,10 +123,10 @@ def analytic(centre: tuple[float, float] = JUNCTION, size: float = SIZE) -> RVE:
     return RVE(supercell(size), MATERIAL, [PATTERN], centre)
 
 
-def centred(n: int) -> list[RVE]:
-    """Of n x n positions: the centres of as many equal parts of a cell."""
-    at = PITCH * (np.arange(n) + 0.5) / n
-    return [analytic((float(x), float(y))) for x in at for y in at]
+def spread(count: int) -> list[RVE]:
+    """Of as many positions of a lattice rule, as ``positions`` of a case has them."""
+    at = np.array(JUNCTION) + PITCH * spread_positions(count)
+    return [analytic((float(x), float(y))) for x, y in at]
 
 
 @cache
@@ -353,8 +365,10 @@ def choices() -> None:
 
     case("as above", analytic())
     case("centre on a hole", analytic(HOLE))
-    case("mean over 2 x 2 centres in a cell", centred(2))
-    case("v free at bulk", analytic(), pattern_at_bulk="free")
+    case("mean over 5 positions in a cell", spread(5))
+    case("v free at bulk along the sides", analytic(), pattern_at_bulk="free")
+    case("v free at bulk before the plates", analytic(), pattern_at_plates="free")
+    case("v free at all bulk", analytic(), pattern_at_plates="free", pattern_at_bulk="free")
     case("Bloch φ", computed())
     sine = PATTERN.sine
     for name, change in (
@@ -366,31 +380,121 @@ def choices() -> None:
 
 
 def positions() -> None:
-    head("body", "N x N", "RVEs", "ε_c", "stress at 8 and 10 % or energy, force")
-    for n in (4, 6, 12):
+    head("body", "positions", "RVEs", "ε_c", "stress at 8 and 10 % or energy, force")
+    for n in (6, 12):
         both = [direct_strip(n, is_cut) for is_cut in (False, True)]
         exact = np.mean([e for e, _ in both])
         stress = np.mean([s for _, s in both], axis=0)
-        for count in (1, 2, 3, 4):
-            e, found = homogenized_strip(n, centred(count))
+        for count in (1, 3, 5, 8):
+            e, found = homogenized_strip(n, spread(count))
             changes = ", ".join(f"{x:+.2%}" for x in found / stress - 1)
-            name = f"strip, {n} cells"
-            row(name, f"{count} x {count}", "", f"{100 * e:.3f} ({e / exact - 1:+.2%})", changes)
-    for size, parts, load, most in (((6, 10), (4, 6), 0.128, 4), ((6, 10), (6, 10), 0.128, 3),
-                                    ((12, 10), (7, 6), 0.127, 3)):  # fmt: skip
-        state = (direct := simulate(Experiment(Specimen(*size), strains=(load,)))).at(load)
+            row(f"strip, {n} cells", count, "", f"{100 * e:.3f} ({e / exact - 1:+.2%})", changes)
+    for size, parts, counts in (((6, 10), (4, 6), (1, 5, 8, 13)), ((6, 10), (6, 10), (1, 5)),
+                                ((12, 10), (7, 6), (1, 5, 8))):  # fmt: skip
+        load = LOADS[size]
+        direct = simulate(Experiment(Specimen(*size), strains=(load,)))
         exact = direct.info["critical"]["strain"]
-        for count in range(1, most + 1):
-            whole, body, _ = homogenized_specimen(
-                centred(count), size, parts, (load,), quarter=True
-            )
+        state = direct.at(load)
+        for count in counts:
+            whole, body, _ = homogenized_specimen(spread(count), size, parts, (load,), quarter=True)
             e, reached = whole.critical.load if whole.critical else np.nan, whole.states[-1]
             row(
-                f"{size[0]} x {size[1]}, {load:.1%}", f"{count} x {count}",
-                body.point_count * count**2, f"{e:.3%} ({e / exact - 1:+.2%})",
-                f"{reached.energy / state.energy - 1:+.2%}, "
+                f"{size[0]} x {size[1]}, {load:.1%}", count, body.point_count * count,
+                f"{e:.3%} ({e / exact - 1:+.2%})", f"{reached.energy / state.energy - 1:+.2%}, "
                 f"{reached.force / state.reaction - 1:+.2%}",
             )  # fmt: skip
+
+
+LOADS = {(6, 10): 0.128, (12, 10): 0.127}
+"""Nominal strains at which specimens are compared [-]."""
+PARTS = {(6, 10): (4, 6), (12, 10): (7, 6)}
+"""Their macroscopic elements, of which a quarter has half as many."""
+
+
+def half_cells(count: int, end: float, is_moved: bool) -> list[tuple[float, float]]:
+    """A hole's coordinate and the side of it, for all half cells between -end and end."""
+    at = PITCH * (np.arange(count + is_moved) + 0.5 * (not is_moved)) - end
+    return [(float(x), s) for x in at for s in (-1.0, 1.0) if abs(x + 0.25 * s * PITCH) < end]
+
+
+def shifted_mesh(specimen: Specimen, shift: tuple[bool, bool], size: float = SIZE) -> Mesh:
+    """The same rectangle with its bulk, the lattice moved by half a cell along x, y or both.
+
+    Where it is moved bulk edges cut holes in two, so that as much of it is material.
+    """
+    half, gap = 0.5 * PITCH, 0.5 * (PITCH - DIAMETER)
+    (a, b), (nx, ny) = specimen.cellular_half_size, (specimen.holes_x, specimen.holes_y)
+    bx, by = specimen.bulk_x, specimen.bulk_y
+    quarter = quarter_cell(PITCH, DIAMETER, size)
+    columns, rows = half_cells(nx, a, shift[0]), half_cells(ny, b, shift[1])
+    blocks = [quarter.placed((sx, sy), (x, y)) for x, sx in columns for y, sy in rows]
+
+    def strip(width: float, is_cut: bool, along_x: bool) -> MeshBlock:
+        """Bulk beside half a cell, from its hole's centre at 0 to its corner at l / 2."""
+        n, m = divisions_of(width, size), divisions_of(half, size)
+        if not is_cut:
+            return rectangle(width, half, n, m) if along_x else rectangle(half, width, m, n)
+        hole, solid = divisions_of(half - gap, size), divisions_of(gap, size)
+        corners = [(0.0, 0.0), (width, 0.0), (width, half), (0.0, half), (0.0, half - gap)]
+        counts = [n, m, n, solid, hole]
+        if along_x:
+            return mesh_block(corners, counts)
+        corners = [(y, x) for x, y in reversed(corners)]
+        return mesh_block([corners[-1], *corners[:-1]], [hole, solid, n, m, n])
+
+    beside, above = strip(bx, shift[0], True), strip(by, shift[1], False)
+    blocks += [beside.placed((s, sy), (s * a, y)) for s in (-1.0, 1.0) for y, sy in rows]
+    blocks += [above.placed((sx, s), (x, s * b)) for s in (-1.0, 1.0) for x, sx in columns]
+    corner = rectangle(bx, by, divisions_of(bx, size), divisions_of(by, size))
+    blocks += [corner.placed(s, (s[0] * a, s[1] * b)) for s in SIGNS]
+    return join(blocks, 1e-7 * PITCH)
+
+
+def translations() -> None:
+    """Direct simulations of specimens whose lattice is moved against their bulk edges."""
+    for size, first in (((6, 10), 0.078), ((12, 10), 0.082)):
+        load, name, specimen = LOADS[size], f"{size[0]} x {size[1]}", Specimen(*size)
+        head(name, "ε_c", f"energy at {first:.1%} [N]", f"energy at {load:.1%} [N]",
+             "force there [N/mm]", "negative eigenvalues")  # fmt: skip
+        found = []
+        for shift in product((False, True), repeat=2):
+            loading = EdgeCompression(specimen.half_size[0], specimen.length)
+            structure = Structure(shifted_mesh(specimen, shift), MATERIAL, loading)
+            follower = PathFollower(structure, PathOptions())
+            path = [follower.start()]
+            follower.follow_primary(path, (first, load), until_unstable=True)
+            is_odd = specimen.holes_x + shift[0], specimen.holes_y + shift[1]
+            critical = None
+            if any(n % 2 == 0 for n in is_odd):
+                critical = locate_critical(follower, path[-2], path[-1])
+                assert critical is not None
+                (state,) = follow_branch(follower, critical, [load], 1, PITCH)
+            else:  # its pattern has the specimen's own symmetries, and grows from the beginning
+                path, follower.linearisation = path[:1], None
+                follower.follow_primary(path, (first, load), refuse_unstable=True)
+                state = path[-1]
+            before = next(s for s in path if abs(s.strain - first) < 1e-12)
+            found.append([
+                critical.strain if critical else np.nan, structure.energy(before.u),
+                structure.energy(state.u), structure.reaction(state.u, specimen.length),
+            ])  # fmt: skip
+            e, *values = found[-1]
+            moved = " and ".join(axis for axis, is_moved in zip("xy", shift, strict=True)
+                                 if is_moved)  # fmt: skip
+            name_of = f"moved along {moved}" if moved else "whole cells"
+            row(name_of, f"{e:.3%}" if critical else "none",
+                *(f"{v:.5f}" for v in values), state.negative_pivots)  # fmt: skip
+        mean = np.nanmean(found, axis=0)
+        row("mean", f"{mean[0]:.3%}", *(f"{v:.5f}" for v in mean[1:]), "")
+        for count in (1, 5, 8):
+            whole, _, _ = homogenized_specimen(
+                spread(count), size, PARTS[size], (first, load), quarter=True
+            )
+            critical_strain = whole.critical.load if whole.critical else np.nan
+            early, late = whole.states
+            values = [critical_strain, early.energy, late.energy, late.force]
+            cells = compared(values, mean.tolist())
+            row(f"homogenized, {count} position(s)", *cells, late.negative_eigenvalues)
 
 
 HEXAGONAL = Specimen(7, 7, 1.28, 1.386, bulk_x=0.0, bulk_y=0.0, stacking="triangular")
@@ -472,6 +576,40 @@ def measured_flower(modes: ModeSet, state: BranchState) -> list[ModeField]:
         )
     ))  # fmt: skip
     return [mode.snapped for mode in found]
+
+
+def bowing() -> None:
+    """On the buckled branch of the 6 x 10 specimen."""
+    strains = (0.1, 0.107, 0.112, 0.12, 0.128, 0.135, 0.14, 0.145)
+    head("nominal strain", "direct: lowest eigenvalue", "negative pivots")
+    direct = simulate(Experiment(Specimen(), strains=strains))
+    for s in direct.snapshots:
+        lowest = min(s.eigenvalues) if s.eigenvalues else np.nan
+        row(f"{s.nominal_strain:.1%}", f"{lowest:.6f}", s.negative_pivots)
+    head("whole", "RVEs", "ε_c", "stable up to", "not at", "its mode: u along y over u along x",
+         "parity of u along y: x, y")  # fmt: skip
+    loads = tuple(np.arange(0.1, 0.12, 0.001).round(3).tolist())
+    for name, rves, parts, options in (
+        ("one position", [analytic()], (3, 5), {}),
+        ("5 positions", spread(5), (3, 5), {}),
+        ("one position, finer mesh", [analytic()], (6, 10), {}),
+        ("one position, v free along the sides", [analytic()], (3, 5), {"pattern_at_bulk": "free"}),
+    ):
+        found, body, _ = homogenized_specimen(rves, (6, 10), parts, loads, **options)
+        assert found.critical is not None
+        bowed = next(k for k, s in enumerate(found.states) if s.negative_eigenvalues)
+        state = found.states[bowed]
+        at = LinearisedBody(body, state.load, state.value)
+        scale = np.sqrt(np.abs(LinearisedBody(body, 0.0, body.start).stiffness.diagonal()))
+        K = at.stiffness.toarray() / np.outer(scale, scale)
+        mode = eigh(K, subset_by_index=(0, 0))[1][:, 0] / scale
+        u, _ = body.fields(body.T @ mode)
+        tree, across = cKDTree(body.mesh.nodes), u[:, 1]
+        images = [across[tree.query(body.mesh.nodes * sign)[1]] for sign in ((-1, 1), (1, -1))]
+        parities = ", ".join(f"{across @ image / (across @ across):+.2f}" for image in images)
+        row(name, body.point_count * len(body.rves), f"{found.critical.load:.3%}",
+            f"{loads[bowed - 1]:.1%}", f"{loads[bowed]:.1%}",
+            f"{np.linalg.norm(across) / np.linalg.norm(u[:, 0]):.2f}", parities)  # fmt: skip
 
 
 def loads() -> None:
@@ -694,7 +832,8 @@ PICTURE: list[Path] = []
 """Where to draw the size effect, if anywhere."""
 SECTIONS: dict[str, Callable[[], None]] = {
     "cell": cell, "strips": strips, "specimen": specimen, "choices": choices,
-    "positions": positions, "flower": flower, "loads": loads, "independence": independence,
+    "positions": positions, "translations": translations, "bowing": bowing,
+    "flower": flower, "loads": loads, "independence": independence,
     "triangular": triangular, "cost": cost, "ranks": ranks,
 }  # fmt: skip
 

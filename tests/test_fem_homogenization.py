@@ -12,6 +12,7 @@ import gmsh
 import meshio
 import numpy as np
 import pytest
+from foreign_cells import hexagonal_one
 from numpy.typing import NDArray
 
 from modeharvest.fem.bloch.critical import critical_at, first_critical
@@ -227,6 +228,30 @@ def test_three_degenerate_modes_make_a_flower() -> None:
         assert ranked[at][1].negative_eigenvalues == negative
 
 
+def test_modes_that_a_mesh_splits_are_each_followed() -> None:
+    """gmsh's mesh of a rhombus has none of the hexagonal lattice's turns: M points 1 % apart."""
+    lattice, material = hexagonal_one(0.18), TwoTermI1()
+    primitive = PeriodicCell(lattice, material)
+    loading, waves = MacroLoading(((-1.0, 0.0), (0.0, -1.0))), [(np.pi, 0.0), (0.0, np.pi)]
+    points = [critical_at(CellPath(primitive, loading), wave) for wave in waves]
+    loads = [point.load for point in points]
+    assert 1e-4 < abs(loads[0] / loads[1] - 1.0) < 0.02
+    first = min(points, key=lambda point: point.load)
+    modes = real_modes(primitive, first.state, waves)
+    element = RVE(UnitCell(modes.mesh, modes.lattice), material, list(modes.shapes), (0.0, 0.0))
+    pressed = PlateLoading(sides="periodic", lateral=1.0, pattern_at_plates="free")
+    body = HomogenizedBody(rectangle_mesh([0, 1], [0, 1]), element, pressed)
+    found = homogenize(body, [1.2 * first.load], PathOptions(first_step=0.005, largest_step=0.005))
+    assert found.critical is not None
+    assert found.critical.load == pytest.approx(first.load, rel=1e-6)
+    assert (len(found.critical.modes), found.critical.negative_after) == (2, 1)
+    patterns = [pattern for pattern, _ in found.ranked]
+    assert {(1.0, 0.0), (0.0, 1.0)} <= set(patterns)  # what isn't on its own branch is left out
+    for pattern, state in found.ranked:
+        v = np.linalg.norm(state.amplitudes, axis=0)
+        assert (v > 0.1 * v.max()).tolist() == [x != 0 for x in pattern]
+
+
 def test_more_points_than_there_is_memory_for_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before their arrays are made: a case may divide a specimen into a million elements."""
     monkeypatch.setattr(machine, "available_bytes", lambda: 5e6)
@@ -252,6 +277,31 @@ def rve_modes(lattice: UnitCell, material: Ogden) -> list[FloatArray]:
     cell = PeriodicCell(lattice, material)
     state = critical_at(CellPath(cell, uniaxial_strain()), (np.pi, np.pi)).state
     return list(real_modes(cell, state, [(np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)]).shapes)
+
+
+@pytest.mark.parametrize(
+    ("loading", "free_ends", "free_sides"),
+    [
+        (PlateLoading(), False, False),
+        (PlateLoading(pattern_at_plates="free"), True, False),
+        (PlateLoading(pattern_at_bulk="free"), False, True),
+    ],
+)
+def test_v_is_held_before_the_plates_and_along_other_solids_apart(
+    loading: PlateLoading, free_ends: bool, free_sides: bool
+) -> None:
+    """The lattice meets no plate itself: solid strips are between."""
+    body = HomogenizedBody.of_specimen(Specimen(4, 4), rve(), loading, divisions=(2, 2))
+    moves = np.abs(body.T).sum(axis=1).reshape(-1, 3)[:, 2] > 0
+    half, at = 2 * PITCH, np.abs(body.mesh.nodes)
+    is_lattice, near = (at < half + 1e-9).all(axis=1), np.abs(at - half) < 1e-9
+    inside = is_lattice & ~near.any(axis=1)
+    ends, sides = (is_lattice & near[:, k] & ~near[:, 1 - k] for k in (0, 1))
+    assert inside.any()
+    assert moves[inside].all()
+    assert set(moves[ends]) == {free_ends}
+    assert set(moves[sides]) == {free_sides}
+    assert not moves[~is_lattice].any()
 
 
 def test_a_quarter_is_as_the_whole_on_the_primary_path() -> None:

@@ -301,6 +301,10 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     assert amplitude["homogenized_rms_mm"] == pytest.approx(amplitude["measured_rms_mm"], rel=0.3)
     means = summary["displacement"]
     assert means["difference_rms_mm"] < 0.25 * means["measured_rms_mm"]
+    for both in (amplitude, means):
+        assert 0 < both["measured_sd_rms_mm"] < 0.5 * both["measured_rms_mm"]
+        ratio = both["difference_over_sd"] * both["measured_sd_rms_mm"] / both["difference_rms_mm"]
+        assert 0.2 < ratio < 5.0
     assert "Mean displacement v₀ at 13 %" in (out / "report.html").read_text("utf-8")
     assert summary["mode"]["errors"] == "model error"
     assert "phi1 is not observable" in summary["warnings"][0], "four holes are few"
@@ -324,7 +328,7 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
 
 @pytest.mark.dolfinx
 @pytest.mark.parametrize(("centre", "middle"), [("junction", 0.5), ("hole", 0.0)])
-@pytest.mark.parametrize("positions", [1, 2, 3])
+@pytest.mark.parametrize("positions", [1, 2, 5, 8])
 def test_positions_are_spread_evenly_over_a_cell(
     tmp_path: Path, centre: str, middle: float, positions: int
 ) -> None:
@@ -334,7 +338,7 @@ def test_positions_are_spread_evenly_over_a_cell(
     pitch = case.experiment.specimen.pitch
     body = HomogenizationRun(case, tmp_path)._body([rotation_pattern(pitch)])
     centres = np.array([rve.centre for rve in body.rves]) / pitch
-    assert centres.shape == (positions**2, 2)
+    assert centres.shape == (positions, 2)
     assert centres.mean(axis=0) == pytest.approx([middle, middle])
     # Waves of a cell's period shorter than the number of positions vanish in the mean.
     for order in range(1, positions):
@@ -356,9 +360,9 @@ def test_each_position_has_its_file_and_their_mean_counts(tmp_path: Path) -> Non
     run = HomogenizationRun(case_of(tmp_path / "case.toml", text), tmp_path / "out")
     run.homogenize()
     centres, found = [], []
-    for k in range(4):
+    for k in range(2):
         with h5py.File(tmp_path / f"out/rve{k + 1 if k else ''}.h5") as rve:
-            assert (rve.attrs["position"], rve.attrs["positions"]) == (k + 1, 4)
+            assert (rve.attrs["position"], rve.attrs["positions"]) == (k + 1, 2)
             centres.append(rve["centre"][:])
             found.append(rve["states/stresses"][:])
     body = run._body([rotation_pattern(run.case.experiment.specimen.pitch)])

@@ -27,7 +27,7 @@ _LEAST_STEP = 1e-3
 _LEAST_OVERLAP = 0.9
 """Of a mode with itself, its phases snapped [-]."""
 _SAME = 1e-9
-"""Of the largest amplitude: patterns closer than that are one."""
+"""Of the largest wave number: patterns closer than that are one."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ class LatticeMode:
         vector is farther than a tenth from one that repeats on the RVE, or where snapping the
         phases leaves another pattern.
         """
-        waves, hole = mode.family.waves(parameters), _central_hole(specimen)
+        waves, centres = mode.family.waves(parameters), specimen.hole_centres
+        hole = centres[int(np.argmin(np.linalg.norm(centres, axis=1)))]  # the first of several
         found = PlaneWaves.of_sines(waves, mode.half_wavelength, mode.scale).moved(-hole)
         return cls.of_waves(found, vectors, -hole)
 
@@ -147,16 +148,8 @@ class LatticeMode:
 
     def is_same(self, other: LatticeMode) -> bool:
         """Whether snapping has made one pattern of both."""
-        size = float(max(np.abs(self.snapped.sine).max(), np.abs(self.snapped.cosine).max()))
-        parts = ("vectors", "cosine", "sine")
-        off = [np.abs(getattr(self.snapped, n) - getattr(other.snapped, n)).max() for n in parts]
-        return bool(off[0] <= _SAME and max(off[1:]) <= _SAME * size)
-
-
-def _central_hole(specimen: Specimen) -> FloatArray:
-    """(2,) centre of the hole next to the specimen's middle, the first of several [mm]."""
-    centres = specimen.hole_centres
-    return np.asarray(centres[int(np.argmin(np.linalg.norm(centres, axis=1)))])
+        mine, its = (np.vstack(list(vars(mode.snapped).values())) for mode in (self, other))
+        return bool(np.abs(mine - its).max() <= _SAME * np.abs(mine).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +164,13 @@ class ModeParameters:
     by_model_error: FloatArray | None = None
     """(m, m) covariances by noise, and by the residual cell by cell, noise included; None where
     that is not known: a result without its images, a specimen of few cells."""
+    of_fields: FloatArray | None = None
+    """(n, n) the larger one of all the correlation's unknowns, v0's and v1's among them."""
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> ModeParameters:
         """From plain values."""
-        arrays = (content[key] for key in ("values", "by_noise", "by_model_error"))
+        arrays = (content[key] for key in ("values", "by_noise", "by_model_error", "of_fields"))
         known = (None if a is None else np.array(a, dtype=np.float64) for a in arrays)
         return cls(tuple(content["names"]), tuple(content["units"]), *known)  # type: ignore[arg-type]
 

@@ -30,6 +30,7 @@ _FARTHEST = 0.5  # of the pitch: the largest amplitude of a branch
 _SHORTEST = 0.02  # of the first amplitude: the smallest step
 _LIKE = 0.01  # overlap of a critical mode with a pattern below which there is none
 _ALIKE = 1e-6  # of 1: the cosine of directions that are one
+_OWN = 0.8  # cosine of a state's v with that of the mode its branch is to start along
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +77,8 @@ def homogenize(
     ranked: list[tuple[tuple[float, ...], HomogenizedState]] = []
 
     def result(outcome: str) -> Homogenized:
-        return Homogenized(
-            tuple(met), tuple(criticals), outcome, path.linearisations, tuple(ranked)
-        )
+        known = tuple(met), tuple(criticals), outcome, path.linearisations
+        return Homogenized(*known, tuple(ranked))
 
     while pending:
         if not path.follow_primary(pending[0], block):
@@ -191,8 +191,8 @@ def ranked_branches(
     """The branches of a critical point at a load, that of least energy first.
 
     Those along single modes v_i and along sums of them with either sign, the first one positive,
-    each with its pattern. Left out are those that can't be followed, and patterns that the critical
-    modes don't tell apart.
+    each with its pattern. Left out are those that can't be followed, or end on that of another
+    pattern, which is so where a mesh splits the set; and patterns that the modes don't tell apart.
     """
     signs = product((0.0, 1.0, -1.0), repeat=path.body.mode_count)
     patterns = [p for p in signs if next((x for x in p if x), 0.0) > 0]
@@ -201,10 +201,14 @@ def ranked_branches(
         mode = _combined(path, critical, pattern)
         if mode is None:
             continue
+        start = np.nan_to_num(path.body.fields(path.body.T @ mode)[1])
         mode = mode * np.sqrt(path.scale) / np.sqrt(mode @ (path.scale * mode))
         if any(abs(mode @ other) > 1.0 - _ALIKE for other in followed):
             continue
         followed.append(mode)
-        met += [(pattern, s) for s in follow_branch(path, critical, [load], pattern)[0]]
+        states, size = follow_branch(path, critical, [load], pattern)[0], np.linalg.norm
+        fields = [(state, np.nan_to_num(state.amplitudes)) for state in states]
+        met += [(pattern, state) for state, v in fields
+                if np.sum(v * start) > _OWN * size(v) * size(start)]  # fmt: skip
         progress(k, len(patterns), "branches")
     return sorted(met, key=lambda item: float(f"{item[1].energy:.9e}"))  # alike: as they come

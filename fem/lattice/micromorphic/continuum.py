@@ -212,10 +212,15 @@ class HomogenizedBody:
         fixed[sides & (loading.sides in ("guided", "clamped")), 1] = True
         if loading.sides == "clamped":
             fixed[sides, 0], plates = True, plates | sides
-        fixed[plates & (loading.pattern_at_plates == "zero"), 2:] = True
         fixed[np.setdiff1d(np.arange(n), self._lattice_nodes), 2:] = True
+        # Solid strips beyond the lattice's ends go with the plates, all others are bulk.
+        solid, ends = self.mesh.cells[~self.is_lattice], nodes[self._lattice_nodes, 0]
+        middle = nodes[solid, 0].mean(axis=1)
+        is_strip = (middle < ends.min()) | (middle > ends.max())
+        if loading.pattern_at_plates == "zero":
+            fixed[plates, 2:] = fixed[solid[is_strip], 2:] = True
         if loading.pattern_at_bulk == "zero":
-            fixed[np.unique(self.mesh.cells[~self.is_lattice]), 2:] = True
+            fixed[solid[~is_strip], 2:] = True
         self._eliminate(fixed != 0.0, direction, self._followed(bottom, top, near))
 
     def _followed(self, bottom: BoolArray, top: BoolArray, near: float) -> IntArray:
@@ -252,10 +257,10 @@ class HomogenizedBody:
         rigid[:, :2, 2] = np.stack([-X[:, 1], X[:, 0]], axis=1)
         flat = rigid.reshape(-1, 3)
         if np.linalg.matrix_rank(flat - self.T @ self.picked(flat), 1e-6) < 3:
-            raise InputError(
-                "homogenized body: expected supports that leave no rigid motion, got too few; "
-                "give plates more than one node, clamp them or guide the sides"
+            what = (
+                "homogenized body: expected supports that leave no rigid motion, got too few; give"
             )
+            raise InputError(f"{what} plates more than one node, clamp them or guide the sides")
 
     def picked(self, values: FloatArray) -> FloatArray:
         """(free_count, ...) the y nearest to values of all unknowns (size, ...)."""

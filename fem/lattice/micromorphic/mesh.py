@@ -61,10 +61,9 @@ def quadrature(mesh: Mesh, points: int) -> Quadrature:
     area = np.linalg.det(J)
     if not (area > 0).all():
         worst = int(np.argmin(area.min(axis=1)))
-        raise InputError(
-            "macroscopic mesh: expected elements with positive Jacobians (nodes counter-clockwise, "
-            f"corners first), got {area.min():.3g} in element {worst}"
-        )
+        what = "elements with positive Jacobians (nodes counter-clockwise, corners first)"
+        got = f"{area.min():.3g} in element {worst}"
+        raise InputError(f"macroscopic mesh: expected {what}, got {got}")
     gradients = np.einsum("pkb,cpba->cpka", slopes, np.linalg.inv(J))
     return Quadrature(weights * area, shapes, gradients, np.einsum("pk,cka->cpa", shapes, nodes))
 
@@ -104,10 +103,9 @@ def specimen_mesh(
         raise InputError(f"macroscopic mesh: expected divisions of 1 or more, got {divisions}")
     places = []
     for inner, outer, count in zip(half, whole, counts, strict=True):
-        if quarter:
-            places.append(np.unique([*np.linspace(0.0, inner, (count + 1) // 2 + 1), outer]))
-        else:
-            places.append(np.unique([-outer, *np.linspace(-inner, inner, count + 1), outer]))
+        low, parts = (0.0, (count + 1) // 2) if quarter else (-1.0, count)
+        within = np.linspace(low * inner, inner, parts + 1)
+        places.append(np.unique([low * outer, *within, outer]))
     mesh = rectangle_mesh(*places)
     middles = mesh.nodes[mesh.cells[:, :4]].mean(axis=1)
     return mesh, np.all(np.abs(middles) < half, axis=1)

@@ -14,7 +14,7 @@ PATTERN = ("zero", "free")
 
 
 @dataclass(frozen=True)
-class PlateLoading:
+class PlateMotion:
     """Two plates at the edges of least and largest x, moved in proportion to the load e.
 
     At x = +-a they have u_x = -+ e L (compression + bending y / b) / 2 and u_y = +- e L shear / 2
@@ -32,10 +32,16 @@ class PlateLoading:
     sides: str = "free"
     """The edges of least and largest y: "free"; "periodic": v is alike on both, and u but for the
     lateral strain; "guided": u_y is linear between the plates; "clamped": u_x is, too."""
+
+
+@dataclass(frozen=True)
+class PlateLoading(PlateMotion):
+    """A load, what holds the pattern, and whether only a quarter is looked at."""
+
     pattern_at_plates: str = "zero"
     pattern_at_bulk: str = "zero"
-    """Whether v is 0 where the lattice meets a plate or a clamped side, and where it meets solid
-    bulk, or "free": Lambda . n = 0 there."""
+    """Whether v is 0 where the lattice meets a plate, solid before a plate, or a clamped side, and
+    where it meets other solid bulk, such as along the sides; or "free": Lambda . n = 0."""
     quarter: bool = False
     """Whether the body is the quarter x, y >= 0 of one that is its own mirror image: u symmetric,
     v even. Compression only. Instabilities of another symmetry, such as bowing, aren't seen."""

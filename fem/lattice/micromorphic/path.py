@@ -31,6 +31,9 @@ _SMALL = 1e-7
 _DENSE = 1000  # unknowns up to which all eigenvalues are computed
 _FEW = 6  # eigenvalues otherwise
 _ALIKE = 1e-6  # critical modes have eigenvalues that far from the lowest one's [-]
+# Or, where a mesh splits a set of several patterns, that share of those at rest, and one shape of
+# v over the body, which has that share of their square.
+_SPLIT, _SHARED = 3e-2, 0.8
 _NONE: FloatArray = np.zeros((0, 0))
 _SOME = 0.01  # of u: what a mode has at least of the pattern, if that is what becomes unstable
 
@@ -60,11 +63,6 @@ class HomogenizedState:
     rate: FloatArray = field(repr=False)
     """y, then w of this rank's RVEs; their derivatives by the load."""
     branch: str = "primary"
-
-    @property
-    def is_stable(self) -> bool:
-        """Whether neither the whole nor the block of v has a negative eigenvalue."""
-        return self.negative_eigenvalues == 0 == self.pattern_negative
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +98,13 @@ class HomogenizedPath:
         """Half the RVE's shorter vector, what a branch's amplitudes refer to [mm]."""
         start = self.equilibrium(0.0, body.start)
         if start is None or start.negative_eigenvalues:
-            raise InputError(
-                "homogenized body: expected one that is stable without load, got one that isn't; "
-                "check material and mesh, or take more points"
-            )
+            what = "homogenized body: expected one that is stable without load, got one that isn't"
+            raise InputError(f"{what}; check material and mesh, or take more points")
         self.states = [start]
         """The primary path."""
         # A metric that makes eigenvalues of u and v comparable numbers.
-        self.scale = np.abs(self.last.stiffness.diagonal())
+        self._at_rest = self.last.stiffness
+        self.scale = np.abs(self._at_rest.diagonal())
 
     def equilibrium(
         self,
@@ -151,7 +148,8 @@ class HomogenizedPath:
         strains, rows = body.strains(unknowns), np.empty((len(body.own), 2))
         for row, number, w in zip(rows, body.own, body.fluctuations(value), strict=True):
             rve, q = body.rve(number), strains[0][number // len(body.rves)]
-            row[:] = rve.energy(q, w), rve.smallest_jacobian(q, w)
+            u = rve.displacement(q, w)
+            row[:] = rve.cell.body.energy(u) / rve.area, rve.cell.body.smallest_jacobian(u)
         every = body.gathered(rows)
         if not every[..., 1].min() > 0:
             return None
@@ -251,7 +249,13 @@ class HomogenizedPath:
     def _critical_modes(self, block: str) -> tuple[FloatArray, str]:
         """(k, free unknowns) modes of the last state that belong together, and of what kind."""
         values, vectors = self._eigenpairs(block)
-        modes = vectors[:, np.abs(values - values[0]) < _ALIKE].T
+        count = int(np.sum(np.abs(values - values[0]) < _ALIKE))
+        falls = values < _SPLIT * np.sum(vectors * (self._at_rest @ vectors), axis=0)
+        v = np.nan_to_num([self.body.fields(self.body.T @ x)[1].T for x in vectors.T])
+        for n in range(count + 1, min(self.body.mode_count, int(np.argmin([*falls, False]))) + 1):
+            size = np.linalg.svd(v[:n].reshape(-1, v.shape[2]), compute_uv=False) ** 2
+            count = n if size[0] > _SHARED * size.sum() else count
+        modes = vectors[:, :count].T
         peaks = np.array([self.largest(mode) for mode in modes])
         kind = "pattern" if peaks[0, 0] > _SOME * peaks[0, 1] else "displacement"
         return modes / peaks[:, [int(kind != "pattern")]], kind

@@ -37,10 +37,8 @@ class PlaneWaves:
             values = np.array(getattr(self, name), dtype=np.float64)
             object.__setattr__(self, name, values)
             if values.shape != (count, 2) or not count or not np.isfinite(values).all():
-                raise InputError(
-                    f"plane waves: expected finite {name} of shape (w, 2), alike for vectors, "
-                    f"cosine and sine, got {values.shape}"
-                )
+                what = f"finite {name} of shape (w, 2), alike for vectors, cosine and sine"
+                raise InputError(f"plane waves: expected {what}, got {values.shape}")
 
     @classmethod
     def of_sines(cls, waves: ArrayLike, half_wavelength: float, scale: float = 1.0) -> PlaneWaves:
@@ -104,10 +102,9 @@ def snapped(
     worst = int(np.argmax(change))
     if not change[worst] <= _SNAP:
         k = ", ".join(f"{value:.4g}" for value in mode.vectors[worst])
-        raise InputError(
-            f"mode: expected wave vectors within {_SNAP:.0%} of one that repeats on the cell, got "
-            f"({k}) rad/mm, which is {change[worst]:.0%} off; take a larger cell (enlarged)"
-        )
+        what = f"wave vectors within {_SNAP:.0%} of one that repeats on the cell"
+        got = f"({k}) rad/mm, which is {change[worst]:.0%} off; take a larger cell (enlarged)"
+        raise InputError(f"mode: expected {what}, got {got}")
     found = replace(mode, vectors=nearest)._turned(
         (mode.vectors - nearest) @ np.asarray(about, dtype=np.float64)
     )

@@ -15,6 +15,7 @@ are q = (F̄_11, F̄_12, F̄_21, F̄_22, v_1 ..., g_1x, g_1y, ...), stresses in 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -34,6 +35,7 @@ NORMALISATIONS = ("rms", "largest", "given")
 """The mean of phi . phi over the material is 1; max |phi| at nodes is 1; phi as it is given."""
 _PERIODIC = 1e-6  # of max |phi|: by how much partner nodes may differ
 _DEPENDENT = 1e-6  # least singular value of normalised modes
+_GOLDEN = 0.5 * (3.0 - math.sqrt(5.0))
 _ITERATIONS = 12
 _SMALL = 1e-10  # of the forces that a unit of F̄ makes, before one more step
 _SHORTEST = 1e-4  # of the way to given strains: the smallest step
@@ -89,9 +91,8 @@ class RVE:
         self._mass = self.cell.nodal_mass
         given = [_at_nodes(mode, k, cell)[masters] for k, mode in enumerate(modes, start=1)]
         fields = np.array(given, dtype=np.float64).reshape(len(modes), len(masters), 2)
-        shapes, self.scales = self._normalised(fields, normalisation)
         self.normalisation = normalisation
-        self.shapes = shapes
+        self.shapes, self.scales = shapes, _ = self._normalised(fields, normalisation)
         """(m, n, 2) the modes at the nodes of ``cell``."""
         X = about.mesh.nodes
         along = (shapes[:, None] * X.T[None, :, :, None]).reshape(-1, len(X), 2)
@@ -151,7 +152,7 @@ class RVE:
                 return None
             w = w + at.relaxed
             if np.linalg.norm(at.forces) <= _SMALL * np.linalg.norm(at.on_carriers[:, :4]):
-                if not self.smallest_jacobian(q, w) > 0:
+                if not self.cell.body.smallest_jacobian(self.displacement(q, w)) > 0:
                     return None
                 nodal = self.displacement(q, w) - self._carried(q)
                 stresses, moduli = at.relaxed_forces / self.area, at.condensed / self.area
@@ -172,10 +173,6 @@ class RVE:
         """Stored energy per area of the cell, holes included [MPa]."""
         return self.cell.body.energy(self.displacement(strains, fluctuation)) / self.area
 
-    def smallest_jacobian(self, strains: FloatArray, fluctuation: FloatArray) -> float:
-        """Smallest det F at the corners and mid-sides of all elements [-]."""
-        return self.cell.body.smallest_jacobian(self.displacement(strains, fluctuation))
-
     def _carried(self, strains: FloatArray) -> FloatArray:
         return np.asarray((self.carriers @ (strains - self.at_rest)).reshape(-1, 2))
 
@@ -195,10 +192,8 @@ class RVE:
             where = int(np.argmin(rms > _DEPENDENT * largest)) + 1
             raise InputError(f"mode {where}: expected a field that varies, got a constant one")
         if len(fields) and np.linalg.eigvalsh(gram / np.outer(rms, rms))[0] < _DEPENDENT**2:
-            raise InputError(
-                f"modes: expected linearly independent ones, got {len(fields)} of which one is a "
-                "sum of the others; leave it out"
-            )
+            got = f"{len(fields)} of which one is a sum of the others; leave it out"
+            raise InputError(f"modes: expected linearly independent ones, got {got}")
         peak = np.linalg.norm(fields, axis=2).max(axis=1, initial=0.0)
         scales = {"rms": 1.0 / rms, "largest": 1.0 / peak, "given": np.ones(len(rms))}[how]
         return scales[:, None, None] * fields, scales
@@ -218,11 +213,23 @@ class RVE:
         rows, size = np.linalg.qr(reduced[self.cell.free_dofs])
         diagonal = np.abs(np.diag(size))
         if not diagonal.min() > _DEPENDENT * diagonal.max():
+            what = "modes: expected phi_i and phi_i X to be linearly independent on the cell"
             raise InputError(
-                "modes: expected phi_i and phi_i X to be linearly independent on the cell, got "
-                "such that are not; leave modes out or take a larger cell"
+                f"{what}, got such that are not; leave modes out or take a larger cell"
             )
         return np.ascontiguousarray(rows.T)
+
+
+def spread_positions(count: int) -> FloatArray:
+    """(count, 2) places in a cell, from its middle and in its vectors, whose mean is the cell's.
+
+    A lattice rule (Sloan & Joe, 1994): all differ evenly along either vector, and they are
+    symmetric about the middle, so that no position alone makes v grow.
+    """
+    turn = min((n for n in range(1, count + 1) if math.gcd(n, count) == 1),
+               key=lambda n: abs(n - _GOLDEN * count))  # fmt: skip
+    along = (np.arange(count) - 0.5 * (count - 1)) / count
+    return np.stack([along, turn * along - np.rint(turn * along)], axis=1)
 
 
 def centred_cell(cell: UnitCell, centre: FloatArray) -> tuple[UnitCell, IntArray]:
@@ -261,9 +268,10 @@ def _at_nodes(mode: ModeField, number: int, cell: UnitCell) -> FloatArray:
     if not largest > 0:
         raise InputError(f"mode {number}: expected a field other than 0")
     if off > _PERIODIC * largest:
-        raise InputError(
-            f"mode {number}: expected a field with the cell's period, got one that differs by "
-            f"{off / largest:.2g} of its maximum at partner nodes; snap its wave vectors to the "
-            "cell (patterns.snapped) or take a larger cell (enlarged)"
+        got = f"one that differs by {off / largest:.2g} of its maximum at partner nodes"
+        remedy = (
+            "snap its wave vectors to the cell (patterns.snapped) or take a larger cell (enlarged)"
         )
+        what = f"mode {number}: expected a field with the cell's period"
+        raise InputError(f"{what}, got {got}; {remedy}")
     return values

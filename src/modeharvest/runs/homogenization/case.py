@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import model_validator
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading
+from modeharvest.fem.lattice.micromorphic.options import PlateLoading, PlateMotion
 from modeharvest.fem.materials import MATERIALS
 from modeharvest.idic.modes import FAMILIES
 from modeharvest.idic.setup import SquareLatticeOptions
@@ -89,8 +89,7 @@ class HomogenizationOptions:
     """About which the RVE of 2 x 2 cells is cut, or a point of it [mm]; by default a junction in
     square stacking, in triangular one a hole, about which its three modes are alike."""
     positions: int = 1
-    """RVEs along x and y at each point, whose mean counts: centred there and a ``positions``-th of
-    a cell apart."""
+    """RVEs at each point, whose mean counts: about there, and evenly spread over a cell."""
     mesh_size: float = 0.2
     """Edge length of the RVE's elements [mm]."""
     pattern_at_plates: Literal["zero", "free"] = "zero"
@@ -113,24 +112,15 @@ class HomogenizationOptions:
     def __post_init__(self) -> None:
         what = "homogenization: expected"
         require_within(f"{what} mesh_size", self.mesh_size, 0.0, above=True)
-        require_within(f"{what} positions", self.positions, 1, 10)
+        require_within(f"{what} positions", self.positions, 1, 100)
         for number in self.divisions or ():
             require_within(f"{what} divisions", number, 1, 1000)
 
 
 @dataclass(frozen=True)
-class SpecimenLoading:
-    """What a homogenized specimen is put under where that isn't the experiment's compression.
+class SpecimenLoading(PlateMotion):
+    """What a homogenized specimen is put under where that isn't the experiment's compression."""
 
-    As in ``fem.lattice.micromorphic.options.PlateLoading``; the load e multiplies all rates.
-    """
-
-    compression: float = 1.0
-    shear: float = 0.0
-    bending: float = 0.0
-    lateral: float = 0.0
-    sides: str = "free"
-    plates: str = "clamped"
     loads: tuple[float, ...] = ()
     """e of the states to keep, ascending [-]; by default the experiment's strains."""
 
@@ -209,26 +199,21 @@ class HomogenizationCase(CaseModel):
     @model_validator(mode="after")
     def _can_be_homogenized(self) -> Self:
         experiment, specimen = self.experiment, self.experiment.specimen
-        if specimen.stacking == "rectangular" or specimen.diameter_y is not None:
-            raise InputError(
-                "homogenization: expected round holes in square or triangular stacking, got "
-                f"{specimen.stacking} stacking, diameter_y = {specimen.diameter_y}"
-            )
-        if self.quarter and not (specimen.stacking == "square" and self.is_experiment):
-            raise InputError(
-                "homogenization: expected quarter = false but for square stacking and the "
-                "experiment's own load and shape, got true"
-            )
-        if specimen.grading_x or specimen.grading_y or not experiment.is_perfect:
-            raise InputError(
-                "homogenization: expected a specimen without grading, scatter and tilt: one RVE "
-                "stands for all of it"
-            )
-        if experiment.guided and self.is_experiment and not self.quarter:
-            raise InputError(
-                "homogenization: expected quarter = true for a guided specimen, whose middle line "
-                "stays straight, got false"
-            )
+        got, is_perfect = specimen.stacking, experiment.is_perfect
+        for is_wrong, expected in (
+            (got == "rectangular" or specimen.diameter_y is not None,
+             "round holes in square or triangular stacking, "
+             f"got {got} stacking, diameter_y = {specimen.diameter_y}"),
+            (self.quarter and not (got == "square" and self.is_experiment),
+             "quarter = false but for square stacking and the experiment's own load and shape, "
+             "got true"),
+            (specimen.grading_x or specimen.grading_y or not is_perfect,
+             "a specimen without grading, scatter and tilt: one RVE stands for all of it"),
+            (experiment.guided and self.is_experiment and not self.quarter,
+             "quarter = true for a guided specimen, whose middle line stays straight, got false"),
+        ):  # fmt: skip
+            if is_wrong:
+                raise InputError(f"homogenization: expected {expected}")
         for x in () if isinstance(self.centre, str) else self.centre:
             most = 2.0 * specimen.pitch
             require_within("homogenization: expected a centre [mm]", x, -most, most)
@@ -241,9 +226,7 @@ class HomogenizationCase(CaseModel):
         if isinstance(self.mode, FileMode) and self.mode.is_computed:
             count = max(numbers, default=1)  # as many as the file has
         if len(set(numbers)) < len(numbers) or not all(1 <= n <= count for n in numbers):
-            raise InputError(
-                f"mode: expected different numbers from 1 to {count} in {specimen.stacking} "
-                f"stacking, got {numbers}"
-            )
+            what = f"different numbers from 1 to {count} in {specimen.stacking} stacking"
+            raise InputError(f"mode: expected {what}, got {numbers}")
         _ = self.plates  # or an InputError
         return self

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -231,11 +231,12 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         wanted = 1 - np.pi * specimen.diameter**2 / 4 / abs(np.linalg.det(specimen.vectors))
         is_same = np.abs(steps - np.rint(steps)).max() < _SAME > abs(abs(np.linalg.det(steps)) - 1)
         if self.case.homogenization.mesh is None and not (is_same and abs(share - wanted) < _SAME):
-            raise InputError(
-                f"{mode.path}: expected modes of the specimen's lattice, solid to {wanted:.1%}, "
-                f"got modes of a cell with vectors {given.primitive.round(4).tolist()} mm, solid "
-                f"to {share:.1%}; compute them for this specimen, or give a mesh of another body"
+            what = f"{mode.path}: expected modes of the specimen's lattice, solid to {wanted:.1%}"
+            got = (
+                f"a cell with vectors {given.primitive.round(4).tolist()} mm, solid to {share:.1%}"
             )
+            remedy = "compute them for this specimen, or give a mesh of another body"
+            raise InputError(f"{what}, got modes of {got}; {remedy}")
         return given
 
     @cached_property
@@ -328,13 +329,10 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         modes, numbers = result.ansatz.modes, self._numbers
         if len(modes) <= max(numbers) or not all(modes[k].family.size for k in numbers):
             free = sum(mode.family.size > 0 for mode in modes)
-            raise InputError(
-                f"mode: expected a result with {max(numbers) + 1} free mode(s), as "
-                f"{specimen.stacking} stacking has, got {free} of {len(modes)}; give the numbers "
-                "of those to use"
-            )
-        pair = self._pair
-        parameters = self._parameters(result, pair)
+            what = f"{max(numbers) + 1} free mode(s), as {specimen.stacking} stacking has"
+            got = f"{free} of {len(modes)}; give the numbers of those to use"
+            raise InputError(f"mode: expected a result with {what}, got {got}")
+        parameters = self._parameters(result, pair := self._pair)
         seen = identifiability(result, None if pair is None else pair.mask)
         try:
             found = self._modes_of(parameters.values)
@@ -357,11 +355,9 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             part = slice(first, first := first + own.family.size)
             off = mode.deviation(own, parameters.covariance[part, part])
             if parameters.by_model_error is not None and off > _FAR:
-                warnings.append(
-                    f"phi{k + 1}: snapping to the lattice changed a wave vector by "
-                    f"{mode.wave_change.max():.2%}, {off:.1f} of its standard deviations: is this "
-                    "mode of this lattice?"
-                )
+                change = f"{mode.wave_change.max():.2%}, {off:.1f} of its standard deviations"
+                warnings.append(f"phi{k + 1}: snapping to the lattice changed a wave vector by "
+                                f"{change}: is this mode of this lattice?")  # fmt: skip
         return tuple(warnings)
 
     @property
@@ -376,21 +372,16 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         """With the covariances that the result, and its images where they are there, have."""
         known, ansatz = Covariance(result.covariance(), None), result.ansatz
         if pair is not None:
-            noise, pitch = ImageNoise.of(result.noise_sd), self.case.experiment.specimen.pitch
-            known = covariance(result, pair, noise, pitch, self.case.correlation.edge_px)
-        families = [ansatz.modes[k].family for k in self._numbers]
+            images, pitch = ImageNoise.of(result.noise_sd), self.case.experiment.specimen.pitch
+            known = covariance(result, pair, images, pitch, self.case.correlation.edge_px)
         at = np.concatenate([np.arange(result.unknowns.size)[ansatz.phi_slice(k)]
                              for k in self._numbers])  # fmt: skip
-        both = (
-            C if C is None else C[np.ix_(at, at)] for C in (known.by_noise, known.by_model_error)
-        )
-        names = [
-            f"phi{k + 1}.{name}" if len(families) > 1 else name
-            for k, family in zip(self._numbers, families, strict=True)
-            for name in family.names
-        ]
-        units = [unit for family in families for unit in family.units]
-        return ModeParameters(tuple(names), tuple(units), result.unknowns[at], *both)  # type: ignore[arg-type]
+        both, every = (known.by_noise, known.by_model_error), np.ix_(at, at)
+        prefix = "" if len(self._numbers) > 1 else f"phi{self._numbers[0] + 1}."
+        names = tuple(result.names[k].removeprefix(prefix) for k in at)
+        units, larger = tuple(ansatz.units[k] for k in at), both[known.by_model_error is not None]
+        noise, error = (C if C is None else C[every] for C in both)
+        return ModeParameters(names, units, result.unknowns[at], noise, error, larger)  # type: ignore[arg-type]
 
     def _fields(self, modes: Sequence[LatticeMode]) -> list[ModeField]:
         """phi in the RVE's coordinates; those that are not given are computed."""
@@ -419,14 +410,13 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         experiment, how, cell = self.case.experiment, self.case.homogenization, self._cell
         from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
         from modeharvest.fem.lattice.micromorphic.mesh import read_body_mesh
-        from modeharvest.fem.lattice.micromorphic.rve import RVE
+        from modeharvest.fem.lattice.micromorphic.rve import RVE, spread_positions
 
-        specimen, half, n = experiment.specimen, 0.5 * experiment.specimen.pitch, how.positions
+        specimen, half = experiment.specimen, 0.5 * experiment.specimen.pitch
         junction = half, half / np.sqrt(3.0) if specimen.is_staggered else half
         known: dict[Any, Any] = {"junction": junction, "hole": (0.0, 0.0)}
         middle = known.get(self.case.centre, self.case.centre)
-        steps = (np.arange(n) + 0.5 - 0.5 * n) / n
-        centres = middle + np.array(list(product(steps, steps))) @ self._vectors
+        centres = middle + spread_positions(how.positions if modes else 1) @ self._vectors
         rves = [RVE(cell, experiment.material, modes, c, normalisation="given") for c in centres]
         plates = self.case.plates
         if how.mesh is None:

@@ -12,6 +12,7 @@ import numpy as np
 from modeharvest.fem.field import Mesh, read_values, write_values
 from modeharvest.fem.lattice.micromorphic.mesh import quadrature
 from modeharvest.idic.result import Result
+from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import atomic_hdf5, open_hdf5
 from modeharvest.util.machine import on_first
@@ -156,6 +157,13 @@ class HomogenizationData:
         (x, y), a, of = points.T[..., None], self.measured.unknowns, self.measured.ansatz
         return np.hstack([of.v0(a, x, y)[:, 0], of.v(0, a, x, y)])
 
+    def measured_sd(self, points: FloatArray) -> FloatArray:
+        """(n, 3) their standard deviations by the measurement's."""
+        (x, y), known = points.T[..., None], self.parameters
+        assert self.measured is not None
+        errors = field_errors(self.measured, x, y, np.asarray(known and known.of_fields))
+        return np.hstack([errors.v0[:, 0], errors.v[0]])
+
 
 def not_reached(response: Mapping[str, Any], count: int) -> list[str]:
     """A warning if there are fewer states than the ``count`` that was asked for."""
@@ -196,7 +204,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
             "rve.h5": "the RVE for other codes: mesh, pairs, modes, moduli (HDF5)",
             "rve.mat": "the same mesh, pairs and modes in the layout of a MATLAB FE2 code",
             **{f"rve{k}.{kind}": f"the same of position {k}" for kind in ("h5", "mat")
-               for k in range(2, case["homogenization"]["positions"] ** 2 + 1)},
+               for k in range(2, case["homogenization"]["positions"] + 1)},
             "homogenized.json": "critical strain, forces, energies, sensitivities",
             "mode.json": "the modes as they were measured and snapped, with their covariances",
             "experiment/": "the virtual experiment: simulation, images, what was measured in them",
@@ -208,7 +216,8 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
 def _compared(data: HomogenizationData) -> dict[str, dict[str, float] | None]:
     """Of u with v0, and of v1 with v1: rms homogenized, measured, of their difference [mm].
 
-    Over the lattice; of v0 that of its length. Of several modes v1 isn't compared: which one is
+    Over the lattice; of v0 that of its length; with the measured one's standard deviation, and the
+    difference over that, a component. Of several modes v1 isn't compared: which one is
     strongest, and their signs, are those of one branch of several that are alike.
     """
     state, mesh = data.compared, data.fields.mesh
@@ -219,15 +228,18 @@ def _compared(data: HomogenizationData) -> dict[str, dict[str, float] | None]:
     at = quadrature(Mesh(mesh.nodes, cells, mesh.element), 3)
     nodal = np.hstack([state.displacement, state.amplitudes])[cells]
     homogenized = np.einsum("pk,ckf->cpf", at.shapes, nodal).reshape(-1, nodal.shape[-1])
-    measured, weights = data.measured_at(at.places.reshape(-1, 2)), at.weights.ravel()
-    parts = {"displacement": (homogenized[:, :2], measured[:, :2])}
+    places, weights = at.places.reshape(-1, 2), at.weights.ravel()
+    measured, sd = data.measured_at(places), data.measured_sd(places)
+    parts = {"displacement": (homogenized[:, :2], measured[:, :2], sd[:, :2])}
     if len(data.modes) == 1:
-        parts["amplitude"] = aligned(homogenized[:, 2:], measured[:, 2:])
-    for name, (ours, theirs) in parts.items():
-        values = {"homogenized": ours, "measured": theirs, "difference": ours - theirs}
+        parts["amplitude"] = *aligned(homogenized[:, 2:], measured[:, 2:]), sd[:, 2:]
+    for name, (ours, theirs, error) in parts.items():
+        off = ours - theirs
+        values = {"homogenized": ours, "measured": theirs, "measured_sd": error, "difference": off}
         rms = {f"{k}_rms_mm": float(np.sqrt(np.average(np.sum(v**2, axis=1), weights=weights)))
                for k, v in values.items()}  # fmt: skip
-        found[name] = {"nominal_strain": state.load} | rms
+        ratio = np.sqrt(np.average(np.mean((off / error) ** 2, axis=1), weights=weights))
+        found[name] = {"nominal_strain": state.load, "difference_over_sd": float(ratio)} | rms
     return found
 
 
