@@ -287,7 +287,7 @@ def rve_modes(lattice: UnitCell, material: Ogden) -> list[FloatArray]:
         (PlateLoading(pattern_at_bulk="free"), False, True),
     ],
 )
-def test_v_is_held_before_the_plates_and_along_other_solids_apart(
+def test_v_is_fixed_before_the_plates_and_along_other_solids_apart(
     loading: PlateLoading, free_ends: bool, free_sides: bool
 ) -> None:
     """The lattice meets no plate itself: solid strips are between."""
