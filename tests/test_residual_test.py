@@ -24,7 +24,7 @@ from modeharvest.idic.solver.residual_test import (
     lags_for,
 )
 from modeharvest.idic.uncertainty.covariance import field_errors
-from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.imaging.spline import SplineImage
@@ -209,3 +209,16 @@ def test_unknowns_without_information_are_named() -> None:
 def test_mask_of_another_size() -> None:
     with pytest.raises(InputError, match="like the images"):
         identifiability(noisy(), np.zeros((3, 3), dtype=bool))
+
+
+def test_a_mode_that_did_not_grow_beside_others_is_not_put_down_to_an_unbuckled_specimen() -> None:
+    """Of three modes of triangular stacking one compression makes two grow."""
+    weak, strong = (
+        Identifiability(1.0, (), (), (), model_error_px=1.0, amplitude_px=sizes).warnings
+        for sizes in ((0.1, 0.2, 0.1), (5.0, 0.2, 6.0))
+    )
+    assert ["before buckling" in text for text in weak] == 3 * [True]
+    assert len(strong) == 1
+    assert strong[0].startswith("phi2 is not observable")
+    assert "(others are)" in strong[0]
+    assert "before buckling" not in strong[0]

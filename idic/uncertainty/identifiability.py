@@ -64,12 +64,13 @@ class Identifiability:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a user should know, one sentence each."""
+        has_others = len(self.unobservable) < len(self.amplitude_px)
+        why = ("before buckling there is no pattern to measure", "others are")[has_others]
         found = [
             f"phi{i + 1} is not observable: v{i + 1} phi{i + 1} is {self.amplitude_px[i]:.2g} px "
-            f"rms, the model error about {self.model_error_px:.2g} px (before buckling "
-            "there is no pattern to measure); fix the mode, or don't interpret it"
-            for i in self.unobservable
-        ]
+            f"rms, the model error about {self.model_error_px:.2g} px ({why}); fix the mode, or "
+            "don't interpret it" for i in self.unobservable
+        ]  # fmt: skip
         if self.speckle_px < FINE * self.model_error_px:
             found.append(
                 f"the speckle is {self.speckle_px:.2g} px wide, the model error about "
@@ -80,9 +81,8 @@ class Identifiability:
         if self.undetermined:
             names = ", ".join(self.undetermined[:_LISTED])
             more = ", ..." if len(self.undetermined) > _LISTED else ""
-            found.append(
-                f"the images say nothing about {len(self.undetermined)} unknowns: {names}{more}"
-            )
+            what = f"{len(self.undetermined)} unknowns: {names}{more}"
+            found.append(f"the images say nothing about {what}")
         return tuple(found)
 
 
