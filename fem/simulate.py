@@ -120,16 +120,9 @@ class _Run:
         symmetries decides, so that the sign isn't left to rounding.
         """
         mode, spec = critical.modes[0], self.experiment.specimen
-
-        def asymmetric(points: FloatArray) -> FloatArray:
-            """Which no symmetry of a rectangle maps to plus or minus itself."""
-            x, y = (points / spec.half_size).T
-            along, across = (1.0 + 0.7 * x) * (1.0 + 0.3 * y), (1.0 - 0.2 * x) * (1.0 - 0.6 * y)
-            return np.stack([along, across], axis=1)
-
         overlap = 0.0 if spec.is_staggered else self._pattern_overlap(mode)
         if abs(overlap) < 1e-6:
-            overlap = mode.overlap(self.follower.structure.from_function(asymmetric))
+            overlap = mode.overlap(self.follower.structure.from_function(spec.asymmetric))
         if overlap < 0:
             critical.modes[0] = mode.reversed()
         return critical

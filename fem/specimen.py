@@ -265,6 +265,12 @@ class Specimen:
         y = np.pi * (points[:, 1] + b) / self.row_distance
         return np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], axis=-1)
 
+    def asymmetric(self, points: FloatArray) -> FloatArray:
+        """A field (n, 2) at points that no symmetry of a rectangle maps to plus or minus itself."""
+        x, y = (points / self.half_size).T
+        along, across = (1.0 + 0.7 * x) * (1.0 + 0.3 * y), (1.0 - 0.2 * x) * (1.0 - 0.6 * y)
+        return np.stack([along, across], axis=1)
+
 
 def centred(count: int) -> FloatArray:
     """(count,) numbers at a distance of 1, with a mean of exactly 0."""

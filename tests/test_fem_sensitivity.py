@@ -11,6 +11,8 @@ from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.finite_element.identify import Scalar, Unknown, identify
+from modeharvest.idic.finite_element.observed import FieldData
 from modeharvest.util.errors import InputError
 
 SMALL = Specimen(4, 4, diameter=1.6, bulk_x=0.9, bulk_y=0.4)
@@ -45,11 +47,10 @@ def require_derivatives(test: ParametricTest, values: np.ndarray) -> None:
 
 
 def test_a_parametric_test_is_the_simulation_with_these_parameters() -> None:
-    material = Ogden((0.9,), (2.5,), 4.0)
-    experiment = Experiment(SMALL, material, strains=(BEFORE, AFTER), mesh_size=0.6)
-    direct = simulate(experiment)
-    test = made((BEFORE, AFTER), OGDEN)
-    found = test.at(np.array([0.9, 2.5, 4.0, 1.0, 0.0]), with_derivatives=False)
+    """Whatever the material that it was made with."""
+    direct = simulate(Experiment(SMALL, strains=(BEFORE, AFTER), mesh_size=0.6))
+    test = made((BEFORE, AFTER), OGDEN, material=Ogden((0.9,), (2.5,), 4.0))
+    found = test.at(VALUES, with_derivatives=False)
     assert test.critical_strain == pytest.approx(direct.info["critical"]["strain"], abs=1e-8)
     for state, snapshot in zip(found, direct.snapshots, strict=True):
         assert (state.branch, state.negative_pivots) == (snapshot.branch, 0)
@@ -58,8 +59,8 @@ def test_a_parametric_test_is_the_simulation_with_these_parameters() -> None:
 
 
 def test_before_and_after_buckling() -> None:
-    test = made((BEFORE, AFTER), OGDEN)
-    require_derivatives(test, VALUES)
+    test = made((BEFORE, AFTER), OGDEN[1:4])
+    require_derivatives(test, VALUES[1:4])
     assert BEFORE < test.critical_strain < AFTER
 
 
@@ -74,24 +75,51 @@ def test_on_the_other_branch_of_a_tilted_specimen() -> None:
 
 def test_at_the_bifurcation_with_the_amplitude_as_an_unknown() -> None:
     """The strain there follows; at small amplitudes its derivatives are the critical strain's."""
-    tilted = made((0.1,), ("kappa", "tilt", "amplitude[0]"))
-    require_derivatives(tilted, np.array([5.4, 0.01, 0.2]))
-    test = made((0.1,), ("exponents[0]", "kappa", "amplitude[0]"))
-    require_derivatives(test, np.array([3.0, 5.4, 0.03]))
-    (state,) = test.at(np.array([3.0, 5.4, 1e-3]))
+    tilted = made((0.1,), ("tilt", "amplitude[0]"))
+    require_derivatives(tilted, np.array([0.01, 0.1]))
+    test = made((0.1,), ("kappa", "amplitude[0]"))
+    require_derivatives(test, np.array([5.4, 0.03]))
+    (state,) = test.at(np.array([5.4, 1e-3]))
     assert state.strain == pytest.approx(test.critical_strain, abs=3e-6)  # 2.1 a^2
     assert test.amplitude(state.displacement) == pytest.approx(1e-3, abs=1e-9)
     criticals = []
     for kappa in (5.4 + 1e-4, 5.4 - 1e-4):
-        test.at(np.array([3.0, kappa, 1e-3]), with_derivatives=False)
+        test.at(np.array([kappa, 1e-3]), with_derivatives=False)
         criticals.append(test.critical_strain)
     # Both are located to 1e-7 at most, in fact some 1e-11.
-    assert state.strain_by[1] == pytest.approx((criticals[0] - criticals[1]) / 2e-4, rel=1e-3)
+    assert state.strain_by[0] == pytest.approx((criticals[0] - criticals[1]) / 2e-4, rel=1e-3)
 
 
-def test_another_material() -> None:
+def test_moduli_and_another_material() -> None:
+    require_derivatives(made((BEFORE,), ("moduli[0]",)), np.array([1.2]))
     test = made((BEFORE,), ("c1", "c2", "bulk"), material=TwoTermI1())
     require_derivatives(test, np.array([0.55, 0.3, 55.0]))
+
+
+def test_parameters_are_identified_from_a_state_beside_the_bifurcation() -> None:
+    """1 % beyond it, where u goes with the root of the strain: its amplitude is an unknown, too."""
+    critical = made((BEFORE,), ("amplitude[0]",))
+    critical.at(np.array([0.01]), with_derivatives=False)
+    assert critical.critical_strain is not None
+    strains, sd = (BEFORE, critical.critical_strain + 1e-3), 1e-3
+    true = made(strains, ("kappa",)).at(np.array([5.4]), with_derivatives=False)
+    noise = np.random.default_rng(0).normal(0.0, sd, (2, *MESH.nodes.shape))
+    data = [
+        FieldData(MESH.nodes, s.displacement + e, sd, MESH)
+        for s, e in zip(true, noise, strict=True)
+    ]
+    test = made(strains, ("exponents[0]", "kappa", "amplitude[1]"))
+    unknowns = {
+        "exponents[0]": Unknown(3.5, (0.5, 10.0)),
+        "kappa": Unknown(4.4, (0.5, 100.0)),
+        "amplitude[1]": Unknown(0.05, (1e-4, 1.0)),
+    }
+    readings = Scalar(np.array(strains), 1e-5)
+    found = identify(test.at, data, unknowns, pixel_size=0.03, strains=readings)
+    exact = np.array([3.0, 5.4, test.amplitude(true[1].displacement)])
+    assert np.all(np.abs(found.values - exact) < 4.0 * found.sd)
+    assert found.sd[1] < 0.1
+    assert found.states[1].strain == pytest.approx(strains[1], abs=5e-5)
 
 
 def test_what_it_is_not_made_for() -> None:
@@ -99,3 +127,7 @@ def test_what_it_is_not_made_for() -> None:
         made((BEFORE,), ("mu",))
     with pytest.raises(InputError, match=r"15 % on the buckled\+ path, got none"):
         made((0.15,), ("amplitude[0]",)).at(np.array([5.0]))
+    odd = Experiment(Specimen(4, 2), strains=(0.16,), mesh_size=0.55)
+    bowing = ParametricTest(odd, ("amplitude[0]",), mesh_specimen(odd.specimen, 0.55))
+    with pytest.raises(InputError, match="first buckling mode with a part of the pattern"):
+        bowing.at(np.array([0.01]))

@@ -35,6 +35,8 @@ from modeharvest.util.errors import InputError
 
 _SIGNS = {"buckled+": 1, "buckled-": -1}
 _SHORTEST = 1 / 64  # of a tilt or of an amplitude, in one step
+_NO_PATTERN = 1e-6  # overlap of a mode with the pattern
+_BEYOND = 2.0  # times the last strain: where to look for a critical point at most
 _ATTEMPTS = 3  # with shorter and shorter steps
 
 
@@ -83,7 +85,8 @@ class ParametricTest:
         self._follower = PathFollower(self.structure, experiment.path)
         pattern = self.structure.from_function(spec.pattern)
         weighted = self._follower.mass * pattern
-        self._weights = (1.0 / float(weighted.dot(pattern))) * weighted
+        square = float(weighted.dot(pattern))
+        self._weights, self._norm = (1.0 / square) * weighted, float(np.sqrt(square))
         self.critical_strain: float | None = None
         """Of the last values, if there is a bifurcation [-]."""
 
@@ -123,7 +126,9 @@ class ParametricTest:
         strains = [travel * e for e in self.experiment.strains]
         by_strain = [e for k, e in enumerate(strains) if amplitudes[k] is None]
         name = self.experiment.branches[0]
-        path, critical = self._primary(max(strains), by_strain, name)
+        # A branch of a given amplitude may begin beyond the strains of these parameters.
+        beyond = _BEYOND if len(by_strain) < len(strains) else 1.0
+        path, critical = self._primary(beyond * max(strains), by_strain, name)
         self.critical_strain = None if critical is None else critical.strain
         buckled: list[State] = []
         if critical is not None:
@@ -134,7 +139,7 @@ class ParametricTest:
         for k, e in enumerate(strains):
             amplitude = amplitudes[k]
             if amplitude is not None:
-                state = None if critical is None else self._at_amplitude(critical, amplitude, e)
+                state = None if critical is None else self._at_amplitude(critical, amplitude)
                 branch = name
             else:
                 is_buckled = critical is not None and e > critical.strain
@@ -173,16 +178,28 @@ class ParametricTest:
         return path, None
 
     def _of_branch(self, critical: Critical, name: str) -> Critical:
-        """The critical point with its mode turned to the branch of that name."""
-        share = float(self._weights.dot(critical.modes[0].vector))
+        """The critical point with its mode turned to the branch of that name, as simulated ones."""
+        mode, spec = critical.modes[0], self.experiment.specimen
+        share = self._share(mode.vector)
+        if spec.is_staggered or abs(share) < _NO_PATTERN:
+            share = mode.overlap(self.structure.from_function(spec.asymmetric))
         if share * _SIGNS.get(name, 1) < 0.0:
-            critical.modes[0] = critical.modes[0].reversed()
+            critical.modes[0] = mode.reversed()
         return critical
 
-    def _at_amplitude(self, critical: Critical, target: float, strain: float) -> State | None:
+    def _share(self, mode: PETSc.Vec) -> float:
+        """Overlap of a mode with the pattern [-]."""
+        return float(self._weights.dot(mode)) * self._norm
+
+    def _at_amplitude(self, critical: Critical, target: float) -> State | None:
         """The state of the branch where the pattern has an amplitude [mm]."""
         follower, weights = self._follower, self._weights
         mode = critical.modes[0].vector
+        if abs(self._share(mode)) < _NO_PATTERN:
+            raise InputError(
+                f"expected a first buckling mode with a part of the pattern, whose amplitude "
+                f"amplitude[k] is, got one of another symmetry at {100 * critical.strain:.4g} %"
+            )
         rate = (1.0 / float(weights.dot(mode))) * mode
         points = [BranchPoint(0.0, critical.strain, 0.0, critical.u, rate)]
         origin = self.structure.zero()

@@ -43,7 +43,7 @@ from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.photograph import read_frame, read_reference
 from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.runs.case import CaseModel, of_kind, with_kind
+from modeharvest.runs.case import CaseModel, checked, of_kind, with_kind
 from modeharvest.runs.photographs.prepare import named_files
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within, requiring_dolfinx
@@ -398,9 +398,7 @@ def run_identification(
 ) -> dict[str, Any]:
     """Identify a case's unknowns in a folder; returns what ``summary.json`` holds."""
     source = str(case) if isinstance(case, (str, Path)) else "EXPERIMENT.toml"
-    known = (
-        IdentificationCase.model_validate(case)
-        if isinstance(case, Mapping)
-        else IdentificationCase.of(case)
-    )
+    if isinstance(case, Mapping):
+        case = checked(IdentificationCase, case, "case")
+    known = IdentificationCase.of(case)
     return IdentificationRun(known, Path(folder), source=source, **how).all()
