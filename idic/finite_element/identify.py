@@ -32,6 +32,9 @@ _COARSE = GaussNewtonOptions(tolerance_px=2e-2, max_iterations=20)
 _FINE = GaussNewtonOptions(tolerance_px=1e-4, max_iterations=30)
 _FORCE_PX = 0.01
 """A change of a force by its standard deviation counts as this in the length of a step [px]."""
+_HOLD = 0.3
+"""Standard deviation, in scales, of unknowns about where a coarse level begins: blurred images know
+some of them hardly, and far off the model is another one."""
 _ROUNDS = 4  # of steps with a finer mesh's residual, at most
 _SETTLED = 0.1  # standard errors, rms: of the last of them
 _UNLIKE = 1.5  # times what noise alone makes: a residual that says so
@@ -189,6 +192,8 @@ class _Cost:
     strains: Scalar | None
     by_amplitude: BoolArray
     px: float
+    hold: FloatArray | None = None
+    """(k,) about which coarse levels hold the unknowns; None for the finest."""
     evaluations: int = 0
     _states: dict[bytes, list[ModelState]] = field(default_factory=dict)
 
@@ -217,6 +222,9 @@ class _Cost:
                 r = float(self.strains.values[k] - states[k].strain) / self.strains.sd
                 found.append((r, states[k].strain_by / self.strains.sd))
         for k, unknown in enumerate(self.unknowns.values()):
+            if self.hold is not None:
+                sd = _HOLD * unknown.scale(unknown.start)
+                found.append(((self.hold[k] - values[k]) / sd, np.eye(len(values))[k] / sd))
             if unknown.prior_sd is not None:
                 one = np.eye(len(values))[k] / unknown.prior_sd
                 found.append(((unknown.start - values[k]) / unknown.prior_sd, one))
@@ -300,6 +308,7 @@ def identify(
             if part is not None:
                 part.prepare(level, state)
         how = _FINE if level == stages[-1] else _COARSE
+        cost.hold = None if level == stages[-1] else values
         found = minimise(cost.equations, cost.step_length, values, how, level.factor)
         values = found.unknowns
     assert found is not None
