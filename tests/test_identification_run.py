@@ -16,7 +16,8 @@ from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.photographs.files import read_image, write_image
 from modeharvest.report.identification import identification_report
 from modeharvest.runs.case import Case
-from modeharvest.runs.identification import IdentificationCase, run_identification
+from modeharvest.runs.identification.case import IdentificationCase
+from modeharvest.runs.identification.pipeline import run_identification
 from modeharvest.util.errors import InputError
 
 SPECIMEN = {"holes_x": 4, "holes_y": 2, "diameter": 1.5, "bulk_x": 0.9, "bulk_y": 0.4}
@@ -83,7 +84,9 @@ def test_files_of_images_or_of_fields_say_the_same(
     images = ImageSet.read(folder / "images")
     for k, strain in enumerate(images.strains):
         record = images.info["snapshots"][k]
-        write_image(tmp_path / f"g{k}.tif", read_image(images.folder / record["camera_image"]))
+        image = read_image(images.folder / record["camera_image"])
+        write_image(tmp_path / f"g{k}.tif", image)
+        write_image(tmp_path / f"moved{k}.tif", np.roll(image, 3, axis=1))
         u = images.truth(strain).displacement[::5, ::5]
         x, y = np.meshgrid(images.grid.x[::5], images.grid.y[::5])
         inside = np.isfinite(u[..., 0])
@@ -96,12 +99,17 @@ def test_files_of_images_or_of_fields_say_the_same(
         "images": {"reference": "f.tif", "deformed": ["g*.tif"], "pixel_size": 0.05, **forces},
         "fields": {"fields": ["u*.csv"], "field_sd_mm": 1e-3, **forces},
     }
+    moved = {"deformed": ["moved*.tif"], "rigid_motion": True}
+    by_data["moved camera"] = by_data["images"] | moved
     for name, data in by_data.items():
         tables = {key: value for key, value in BEFORE.items() if key not in ("twin", "imaging")}
         case = IdentificationCase.model_validate(tables | {"data": data})
         case._base = tmp_path
         found = run_identification(case, tmp_path / name)
-        for p, q in zip(found["parameters"], summary["parameters"], strict=True):
+        own, frame = found["parameters"][:3], found["parameters"][3:]
+        shifts = [p["value"] for p in frame if p["name"].startswith("shift_x")]
+        assert shifts == ([] if name != "moved camera" else pytest.approx([0.15, 0.15], abs=0.01))
+        for p, q in zip(own, summary["parameters"], strict=True):
             assert p["true"] is None
             assert abs(p["value"] - q["true"]) < 4.0 * p["sd_with_model_error"]
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.identify import (
+    LEVELS,
     FinerMesh,
     Identified,
     Scalar,
@@ -21,10 +22,16 @@ from modeharvest.idic.finite_element.identify import (
     identify,
 )
 from modeharvest.idic.finite_element.mesh import quadratic
-from modeharvest.idic.finite_element.observed import FieldData, ImageData, nodal_values
+from modeharvest.idic.finite_element.observed import (
+    MOTION,
+    FieldData,
+    ImageData,
+    nodal_values,
+    rigidly_moved,
+)
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.noise import ImageNoise
-from modeharvest.idic.solver.pyramid import FULL
+from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
@@ -141,6 +148,32 @@ def test_the_gradient_is_the_cost_s() -> None:
             cost = [0.5 * data.sums(model(values + s * h)[k]).squares for s in (1.0, -1.0)]
             slope = (cost[0] - cost[1]) / (2 * step)
             assert here.blocks.sum(axis=0)[i] == pytest.approx(slope, rel=1e-3)
+
+
+def test_a_camera_that_has_moved() -> None:
+    """By up to 8 px and 1 degree between the images: a shift and a turn of each are unknowns."""
+    motions = np.array([[0.2, -0.1, 0.01], [0.3, 0.1, -0.02]])
+
+    def moved(values: FloatArray) -> list[State]:
+        own, motion = values[:3], values[3:].reshape(2, 3)
+        return [rigidly_moved(s, MESH.nodes, m, k, 2)  # type: ignore[misc, arg-type]
+                for k, (s, m) in enumerate(zip(model(own), motion, strict=True))]  # fmt: skip
+
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    rng, f, data = np.random.default_rng(0), pattern(x, y), []
+    for (tx, ty, turn), e in zip(motions, LOADS, strict=True):
+        c, s = np.cos(turn), np.sin(turn)
+        X, Y = c * (x - tx) + s * (y - ty), -s * (x - tx) + c * (y - ty)
+        g = pattern(X / (1 + e * TRUE[0]), Y / (1 + e * TRUE[0] * TRUE[1]))
+        noisy = [image + rng.normal(0.0, NOISE, GRID.shape) for image in (f, g)]
+        pair = ImagePair(*noisy, GRID)  # type: ignore[arg-type]
+        data.append(ImageData(pair, MeshPixels(MESH), ImageNoise(NOISE, NOISE)))
+    frame = {f"{n}[{k}]": Unknown(0.0, (-0.6, 0.6)) for k in range(2) for n in MOTION}
+    levels = (Level(4, 3.0), *LEVELS)
+    found = identify(moved, data, UNKNOWNS | frame, pixel_size=0.04, forces=FORCES, levels=levels)
+    exact = np.append(TRUE, motions.ravel())
+    assert np.all(np.abs(found.values - exact) < 4.5 * found.sd)
+    assert np.all(found.sd[3:] < 0.05 * GRID.pixel_size)
 
 
 def test_a_displacement_field_instead_of_images() -> None:

@@ -22,7 +22,7 @@ from modeharvest.idic.finite_element.pixels import (
 )
 from modeharvest.idic.finite_element.result import local_coordinates
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
-from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise
 from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate, locate_points
@@ -68,13 +68,19 @@ class StateData(Protocol):
 
 
 class ImageData:
-    """A pair of images of a state, compared on the pixels that the model's mesh covers."""
+    """A pair of images of a state, compared on the pixels that the model's mesh covers.
 
-    def __init__(self, pair: ImagePair, pixels: MeshPixels, noise: ImageNoise) -> None:
+    noise : of the two; by default that of the reference there, estimated, in both.
+    """
+
+    def __init__(
+        self, pair: ImagePair, pixels: MeshPixels, noise: ImageNoise | None = None
+    ) -> None:
         mesh, grid = pixels.mesh, pair.grid
         covered = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the model").mask
         self.pair = replace(pair, mask=covered & pair.masks[0])
-        self.pixels, self.noise = pixels, noise
+        estimate = estimated_noise(pair.reference, self.pair.masks[0]).sd
+        self.pixels, self.noise = pixels, noise or ImageNoise.of(estimate)
         self.order = spline_order(speckle_size(pair.reference, self.pair.mask))
         self.block = _blocks(mesh)
 
@@ -168,6 +174,40 @@ class FieldData:
         expected = float(np.sqrt(np.mean(1.0 / self._w)))
         return Sums(blocks, matrix, float(np.sum(self._w * left**2)), left.size,
                     float(np.sqrt(np.mean(left**2))), expected)  # fmt: skip
+
+
+MOTION = ("shift_x", "shift_y", "turn")
+"""Unknowns of the camera's frame in each state: of the specimen's middle [mm], about it [rad]."""
+
+
+def rigidly_moved(
+    state: ModelState, nodes: FloatArray, motion: FloatArray, number: int, count: int
+) -> ModelState:
+    """A state as a camera sees it that has moved: turned about the origin and shifted.
+
+    motion : (3,) of this state, in the order of MOTION.
+    number, count : of this state and of all: derivatives by the motions of all are put behind the
+        model's own, and are zero for those of other states.
+    """
+    u, by_turn, R = moved_displacement(state.displacement, nodes, motion)
+    own = np.zeros((3 * count, *nodes.shape))
+    own[3 * number : 3 * number + 3] = (*np.broadcast_to(np.eye(2)[:, None], (2, *nodes.shape)),
+                                        by_turn)  # fmt: skip
+    rest = np.zeros(3 * count)
+    return replace(
+        state, displacement=u, displacement_by=np.concatenate([state.displacement_by @ R.T, own]),
+        force_by=np.append(state.force_by, rest), strain_by=np.append(state.strain_by, rest),
+    )  # fmt: skip
+
+
+def moved_displacement(
+    u: FloatArray, nodes: FloatArray, motion: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(n, 2) displacement with the camera's motion in it, its derivative by the turn, and R."""
+    c, s = np.cos(motion[2]), np.sin(motion[2])
+    R, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
+    at = nodes + u
+    return at @ R.T + motion[:2] - nodes, at @ slope.T, R
 
 
 def _located(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:

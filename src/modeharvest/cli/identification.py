@@ -28,7 +28,8 @@ def identify(
     """
     from modeharvest.report.identification import identification_report
     from modeharvest.report.model import print_report
-    from modeharvest.runs.identification import IdentificationCase, IdentificationRun
+    from modeharvest.runs.identification.case import IdentificationCase
+    from modeharvest.runs.identification.pipeline import IdentificationRun
 
     case = IdentificationCase.read(experiment)
     with bars() as progress:

@@ -1,202 +1,62 @@
-"""Material and supports identified from images and forces: a case, and a folder it is run in.
+"""Material and supports identified from images and forces, in a folder that can be resumed.
 
 ::
 
     images/ forces.json                 data       of a twin: what a test of known truth would leave
     solution.h5 solution.vtu            identify   the model's states with what was found
     report.html summary.json
-
-A case has a table ``[experiment]``, the model: specimen, mesh, nominal strains of the states, and
-the values of what isn't unknown; ``[unknowns]``, each with its start and bounds; and either
-``[data]``, files of images or displacement fields and the load cell's readings, or ``[twin]`` with
-``[imaging]``: data made by the program itself, on another mesh than the one that identifies.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import PrivateAttr, model_validator
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.idic.finite_element.identify import (
+    LEVELS,
     FinerMesh,
     Identified,
     Scalar,
     Unknown,
     identify,
 )
-from modeharvest.idic.finite_element.observed import FieldData, ImageData, StateData, nodal_values
+from modeharvest.idic.finite_element.observed import (
+    MOTION,
+    FieldData,
+    ImageData,
+    StateData,
+    moved_displacement,
+    nodal_values,
+    rigidly_moved,
+)
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.local.field import read_field
-from modeharvest.idic.solver.noise import ImageNoise, estimated_noise
+from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.photograph import read_frame, read_reference
-from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.runs.case import CaseModel, checked, of_kind, with_kind
+from modeharvest.runs.case import checked
+from modeharvest.runs.identification.case import IdentificationCase, MeasuredData, TwinTruth
 from modeharvest.runs.photographs.prepare import named_files
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError, require_within, requiring_dolfinx
+from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, sha256_of, write_json
 from modeharvest.util.stages import StagedRun, exclusive, stage_key, versions
 from modeharvest.util.typed import to_plain
 
-_UNITS = {"exponents": "-", "travel": "-", "tilt": "rad", "amplitude": "mm"}  # else MPa
+_UNITS = {"exponents": "-", "travel": "-", "tilt": "rad", "amplitude": "mm",
+          "shift_x": "mm", "shift_y": "mm", "turn": "rad"}  # else MPa  # fmt: skip
 _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "fenics-dolfinx")
-
-
-@dataclass(frozen=True)
-class MeasuredData:
-    """What a test has left; names of files are relative to the case's."""
-
-    reference: str = ""
-    deformed: tuple[str, ...] = ()
-    """Images: of the undeformed state, and of each strain in the order of the test."""
-    pixel_size: float | None = None
-    """[mm/px]; the specimen's middle is the middle of the images."""
-    noise_sd: float | None = None
-    """Of the camera, in each image [grey levels of the files]; else estimated from the images."""
-    fields: tuple[str, ...] = ()
-    """Displacement fields in mm by any DIC code, one for each strain, instead of images; origin
-    in the specimen's middle, y up."""
-    field_sd_mm: float | None = None
-    """Their standard deviation per component."""
-    forces_N: tuple[float, ...] = ()
-    thickness_mm: float | None = None
-    forces_N_per_mm: tuple[float, ...] = ()
-    """Readings of the load cell at each strain, compression positive: with the specimen's
-    thickness, or by thickness."""
-    force_sd: float | None = None
-    """Standard deviation of the load cell, in the unit of the forces."""
-    strain_sd: float = 1e-5
-    """Standard deviation of nominal strains, for states found by an amplitude [-]."""
-
-    def __post_init__(self) -> None:
-        if bool(self.fields) == bool(self.reference or self.deformed):
-            raise InputError(
-                "data: expected images (reference and deformed) or fields, got "
-                f"{'both' if self.fields else 'neither'}"
-            )
-        if bool(self.reference) != bool(self.deformed):
-            raise InputError("data: expected a reference and deformed images, got one of the two")
-        if self.reference and self.pixel_size is None:
-            raise InputError("data: expected a pixel_size [mm/px] for images, got none")
-        if self.fields and self.field_sd_mm is None:
-            raise InputError("data: expected field_sd_mm for displacement fields, got none")
-        if self.forces_N and self.forces_N_per_mm:
-            raise InputError("data: expected forces_N or forces_N_per_mm, got both")
-        if self.forces_N and self.thickness_mm is None:
-            raise InputError("data: expected thickness_mm with forces_N, got none")
-        if (self.forces_N or self.forces_N_per_mm) and self.force_sd is None:
-            raise InputError("data: expected force_sd with forces, got none")
-        for name in ("pixel_size", "noise_sd", "field_sd_mm", "thickness_mm", "force_sd"):
-            if (value := getattr(self, name)) is not None:
-                require_within(f"data: expected {name}", value, 0.0, above=True)
-        require_within("data: expected strain_sd", self.strain_sd, 0.0, above=True)
-
-    @property
-    def forces(self) -> Scalar | None:
-        """By thickness [N/mm]; None without any."""
-        values = self.forces_N or self.forces_N_per_mm
-        if not values or self.force_sd is None:
-            return None
-        thickness = self.thickness_mm if self.forces_N and self.thickness_mm else 1.0
-        return Scalar(np.array(values) / thickness, self.force_sd / thickness)
-
-
-@dataclass(frozen=True)
-class TwinTruth:
-    """What is true in a test that the program makes itself."""
-
-    material: Material = field(default_factory=Ogden)
-    mesh_size: float = 0.25
-    """Edge length of the elements that the data are made with [mm]."""
-    travel: float = 1.0
-    tilt: float = 0.0
-    force_sd: float = 0.0
-    """Of the load cell; 0 for a test without forces [N/mm]."""
-    force_seed: int = 0
-
-    def __post_init__(self) -> None:
-        require_within("twin: expected mesh_size [mm]", self.mesh_size, 0.0, above=True)
-        require_within("twin: expected force_sd [N/mm]", self.force_sd, 0.0)
-
-    def value(self, name: str) -> float | None:
-        """Of a parameter by its name; None if it has none of that name."""
-        if name in ("travel", "tilt"):
-            return float(getattr(self, name))
-        base, _, number = name.rstrip("]").partition("[")
-        found = getattr(self.material, base, None)
-        if number and isinstance(found, tuple):
-            return float(found[int(number)]) if int(number) < len(found) else None
-        return None if found is None else float(found)
-
-
-class IdentificationCase(CaseModel):
-    """A model with unknowns, and the data that they are identified from."""
-
-    table = "unknowns"
-
-    experiment: Annotated[Experiment, of_kind(MATERIALS, "experiment.material", "material")] = (
-        Experiment()
-    )
-    unknowns: dict[str, Unknown]
-    data: MeasuredData | None = None
-    twin: Annotated[TwinTruth | None, of_kind(MATERIALS, "twin.material", "material")] = None
-    imaging: ImagingSpec = ImagingSpec()
-    finer_mesh_size: float | None = None
-    """Of the mesh whose residual the last steps take [mm]; by default 0.6 of the model's."""
-
-    _base: Path = PrivateAttr(Path())
-
-    @classmethod
-    def read(cls, name: str | Path) -> Self:
-        """Read a case as every other; the files it names are found beside its own."""
-        case = super().read(name)
-        case._base = Path(name).parent
-        return case
-
-    @model_validator(mode="after")
-    def _is_whole(self) -> Self:
-        if self.finer_mesh_size is not None:
-            largest = self.experiment.mesh_size
-            require_within("expected finer_mesh_size [mm]", self.finer_mesh_size, 0.0, above=True)
-            if self.finer_mesh_size >= largest:
-                raise InputError(
-                    f"expected finer_mesh_size below mesh_size ({largest:g} mm), got "
-                    f"{self.finer_mesh_size:g}"
-                )
-        if not self.unknowns:
-            raise InputError("unknowns: expected at least one, got none")
-        if (self.data is None) == (self.twin is None):
-            raise InputError("expected a table [data] or a table [twin], got both or neither")
-        strains = len(self.experiment.strains)
-        if self.data is not None:
-            for name in ("forces_N", "forces_N_per_mm"):
-                if (got := len(getattr(self.data, name))) not in (0, strains):
-                    raise InputError(
-                        f"data: expected as many {name} as strains ({strains}), got {got}"
-                    )
-        return self
-
-    def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values, materials by their kind."""
-        content = super().plain()
-        content["experiment"]["material"] = with_kind(self.experiment.material, MATERIALS)
-        content["experiment"]["specimen"] = self.experiment.specimen.plain()
-        if self.twin is not None:
-            content["twin"]["material"] = with_kind(self.twin.material, MATERIALS)
-        return content
 
 
 @dataclass(frozen=True)
@@ -277,9 +137,26 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         experiment, unknowns = self.case.experiment, self.case.unknowns
         model = self._model(experiment, list(unknowns))
         data, forces, px = self._data(model.mesh)
+        count = 0
+        if self.case.data is not None and self.case.data.rigid_motion:
+            count = len(experiment.strains)
+        length = float(np.ptp(model.mesh.nodes[:, 0]))
+        bounds = {"shift_x": 0.1 * length, "shift_y": 0.1 * length, "turn": 0.1}
+        frame = {f"{name}[{k}]": Unknown(0.0, (-bounds[name], bounds[name]))
+                 for k in range(count) for name in MOTION}  # fmt: skip
+
+        def states(values: FloatArray) -> list[Any]:
+            own, motions = np.split(values, [len(unknowns)])
+            found = model.at(own)
+            return [
+                rigidly_moved(state, model.mesh.nodes, motion, k, count)
+                for k, (state, motion) in enumerate(zip(found, motions.reshape(-1, 3), strict=True))
+            ] if count else found  # fmt: skip
+
         strain_sd = 1e-5 if self.case.data is None else self.case.data.strain_sd
         found = identify(
-            model.at, data, unknowns, pixel_size=px, forces=forces,
+            states, data, unknowns | frame, pixel_size=px, forces=forces,
+            levels=(*[Level(4, 3.0)] * (count > 0), *LEVELS),
             strains=Scalar(np.array(experiment.strains), strain_sd),
             finer=self._finer(list(unknowns), model.mesh), progress=self.progress,
         )  # fmt: skip
@@ -306,10 +183,14 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         model = self._model(replace(experiment, mesh_size=size), names)
 
         def states(values: FloatArray) -> list[tuple[FloatArray, float]]:
-            return [
+            own, motions = np.split(values, [len(names)])
+            found = [
                 (nodal_values(model.mesh, state.displacement, mesh.nodes), state.force)
-                for state in model.at(values, False)
+                for state in model.at(own, False)
             ]
+            for k, motion in enumerate(motions.reshape(-1, 3)):
+                found[k] = moved_displacement(found[k][0], mesh.nodes, motion)[0], found[k][1]
+            return found
 
         return FinerMesh(states, size / experiment.mesh_size)
 
@@ -343,15 +224,10 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         """The images of the files."""
         reference = read_reference(self._files[0])
         grid = PixelGrid.centred(*reference.shape, data.pixel_size or 1.0)
-        found = []
-        for path in self._files[1:]:
-            image = read_frame(path, reference).image
-            pair = ImagePair(reference.image, image, grid)
-            sds = [data.noise_sd] * 2
-            if data.noise_sd is None:
-                sds = [estimated_noise(i, pair.masks[0]).sd for i in (reference.image, image)]
-            found.append(ImageData(pair, pixels, ImageNoise(*map(float, sds))))  # type: ignore[arg-type]
-        return found
+        noise = None if data.noise_sd is None else ImageNoise.of(data.noise_sd)
+        frames = (read_frame(path, reference).image for path in self._files[1:])
+        pairs = (ImagePair(reference.image, image, grid) for image in frames)
+        return [ImageData(pair, pixels, noise) for pair in pairs]
 
     def _summary(self, found: Identified, model: Any) -> dict[str, Any]:
         case, twin, forces = self.case, self.case.twin, found.forces

@@ -1,0 +1,1 @@
+"""Runs that identify material and supports."""

@@ -1,0 +1,170 @@
+"""Material and supports to be identified as a case: model, unknowns, and data or a twin.
+
+A case has a table ``[experiment]``, the model: specimen, mesh, nominal strains of the states, and
+the values of what isn't unknown; ``[unknowns]``, each with its start and bounds; and either
+``[data]``, files of images or displacement fields and the load cell's readings, or ``[twin]`` with
+``[imaging]``: data made by the program itself, on another mesh than the one that identifies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import PrivateAttr, model_validator
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.materials import MATERIALS, Material, Ogden
+from modeharvest.idic.finite_element.identify import Scalar, Unknown
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.runs.case import CaseModel, of_kind, with_kind
+from modeharvest.util.errors import InputError, require_within
+
+
+@dataclass(frozen=True)
+class MeasuredData:
+    """What a test has left; names of files are relative to the case's."""
+
+    reference: str = ""
+    deformed: tuple[str, ...] = ()
+    """Images: of the undeformed state, and of each strain in the order of the test."""
+    pixel_size: float | None = None
+    """[mm/px]; the specimen's middle is the middle of the images."""
+    noise_sd: float | None = None
+    """Of the camera, in each image [grey levels of the files]; else estimated from the images."""
+    fields: tuple[str, ...] = ()
+    """Displacement fields in mm by any DIC code, one for each strain, instead of images; origin
+    in the specimen's middle, y up."""
+    field_sd_mm: float | None = None
+    """Their standard deviation per component."""
+    forces_N: tuple[float, ...] = ()
+    thickness_mm: float | None = None
+    forces_N_per_mm: tuple[float, ...] = ()
+    """Readings of the load cell at each strain, compression positive: with the specimen's
+    thickness, or by thickness."""
+    force_sd: float | None = None
+    """Standard deviation of the load cell, in the unit of the forces."""
+    rigid_motion: bool = False
+    """Whether specimen and camera may have moved against each other between the images: then a
+    shift and a turn of each state are found, too, of up to some 10 px."""
+    strain_sd: float = 1e-5
+    """Standard deviation of nominal strains, for states found by an amplitude [-]."""
+
+    def __post_init__(self) -> None:
+        if bool(self.fields) == bool(self.reference or self.deformed):
+            raise InputError(
+                "data: expected images (reference and deformed) or fields, got "
+                f"{'both' if self.fields else 'neither'}"
+            )
+        if bool(self.reference) != bool(self.deformed):
+            raise InputError("data: expected a reference and deformed images, got one of the two")
+        if self.reference and self.pixel_size is None:
+            raise InputError("data: expected a pixel_size [mm/px] for images, got none")
+        if self.fields and self.field_sd_mm is None:
+            raise InputError("data: expected field_sd_mm for displacement fields, got none")
+        if self.forces_N and self.forces_N_per_mm:
+            raise InputError("data: expected forces_N or forces_N_per_mm, got both")
+        if self.forces_N and self.thickness_mm is None:
+            raise InputError("data: expected thickness_mm with forces_N, got none")
+        if (self.forces_N or self.forces_N_per_mm) and self.force_sd is None:
+            raise InputError("data: expected force_sd with forces, got none")
+        for name in ("pixel_size", "noise_sd", "field_sd_mm", "thickness_mm", "force_sd"):
+            if (value := getattr(self, name)) is not None:
+                require_within(f"data: expected {name}", value, 0.0, above=True)
+        require_within("data: expected strain_sd", self.strain_sd, 0.0, above=True)
+
+    @property
+    def forces(self) -> Scalar | None:
+        """By thickness [N/mm]; None without any."""
+        values = self.forces_N or self.forces_N_per_mm
+        if not values or self.force_sd is None:
+            return None
+        thickness = self.thickness_mm if self.forces_N and self.thickness_mm else 1.0
+        return Scalar(np.array(values) / thickness, self.force_sd / thickness)
+
+
+@dataclass(frozen=True)
+class TwinTruth:
+    """What is true in a test that the program makes itself."""
+
+    material: Material = field(default_factory=Ogden)
+    mesh_size: float = 0.25
+    """Edge length of the elements that the data are made with [mm]."""
+    travel: float = 1.0
+    tilt: float = 0.0
+    force_sd: float = 0.0
+    """Of the load cell; 0 for a test without forces [N/mm]."""
+    force_seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_within("twin: expected mesh_size [mm]", self.mesh_size, 0.0, above=True)
+        require_within("twin: expected force_sd [N/mm]", self.force_sd, 0.0)
+
+    def value(self, name: str) -> float | None:
+        """Of a parameter by its name; None if it has none of that name."""
+        if name in ("travel", "tilt"):
+            return float(getattr(self, name))
+        base, _, number = name.rstrip("]").partition("[")
+        found = getattr(self.material, base, None)
+        if number and isinstance(found, tuple):
+            return float(found[int(number)]) if int(number) < len(found) else None
+        return None if found is None else float(found)
+
+
+class IdentificationCase(CaseModel):
+    """A model with unknowns, and the data that they are identified from."""
+
+    table = "unknowns"
+
+    experiment: Annotated[Experiment, of_kind(MATERIALS, "experiment.material", "material")] = (
+        Experiment()
+    )
+    unknowns: dict[str, Unknown]
+    data: MeasuredData | None = None
+    twin: Annotated[TwinTruth | None, of_kind(MATERIALS, "twin.material", "material")] = None
+    imaging: ImagingSpec = ImagingSpec()
+    finer_mesh_size: float | None = None
+    """Of the mesh whose residual the last steps take [mm]; by default 0.6 of the model's."""
+
+    _base: Path = PrivateAttr(Path())
+
+    @classmethod
+    def read(cls, name: str | Path) -> Self:
+        """Read a case as every other; the files it names are found beside its own."""
+        case = super().read(name)
+        case._base = Path(name).parent
+        return case
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.finer_mesh_size is not None:
+            largest = self.experiment.mesh_size
+            require_within("expected finer_mesh_size [mm]", self.finer_mesh_size, 0.0, above=True)
+            if self.finer_mesh_size >= largest:
+                raise InputError(
+                    f"expected finer_mesh_size below mesh_size ({largest:g} mm), got "
+                    f"{self.finer_mesh_size:g}"
+                )
+        if not self.unknowns:
+            raise InputError("unknowns: expected at least one, got none")
+        if (self.data is None) == (self.twin is None):
+            raise InputError("expected a table [data] or a table [twin], got both or neither")
+        strains = len(self.experiment.strains)
+        if self.data is not None:
+            for name in ("forces_N", "forces_N_per_mm"):
+                if (got := len(getattr(self.data, name))) not in (0, strains):
+                    raise InputError(
+                        f"data: expected as many {name} as strains ({strains}), got {got}"
+                    )
+        return self
+
+    def plain(self) -> dict[str, Any]:
+        """The case as plain JSON values, materials by their kind."""
+        content = super().plain()
+        content["experiment"]["material"] = with_kind(self.experiment.material, MATERIALS)
+        content["experiment"]["specimen"] = self.experiment.specimen.plain()
+        if self.twin is not None:
+            content["twin"]["material"] = with_kind(self.twin.material, MATERIALS)
+        return content
