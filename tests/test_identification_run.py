@@ -27,7 +27,7 @@ BEFORE: dict[str, Any] = {
     "unknowns": {"moduli[0]": {"start": 2.4, "bounds": [0.1, 10.0]},
                  "kappa": {"start": 2.7, "bounds": [0.5, 50.0]},
                  "tilt": {"start": 0.0, "bounds": [-0.5, 0.5]}},
-    "finer_mesh_size": 0.5,
+    "finer_mesh_size": 0.45,
     "twin": {"mesh_size": 0.5, "tilt": 0.1, "force_sd": 0.002, "force_seed": 3},
     "imaging": {"pixel_size": 0.05, "margin_px": 10,
                 "sensor": {"read_noise": 0.01, "read_seed": 5}},
@@ -145,6 +145,7 @@ def test_the_shipped_case_is_one() -> None:
                    "force_sd": 0.1}}, "as many forces_N_per_mm as strains (2), got 1"),
         ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, **FORCES, "force_sd": None}},
          "expected force_sd with forces"),
+        ({"finer_mesh_size": 0.6}, "expected finer_mesh_size [mm] above 0 and at most 0.495"),
         ({"twin": None}, "expected a table [data] or a table [twin]"),
     ],
 )  # fmt: skip

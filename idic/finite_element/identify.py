@@ -18,7 +18,7 @@ from modeharvest.idic.finite_element.observed import ImageData, StateData, Sums
 from modeharvest.idic.solver.assembly import NormalEquations
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, minimise
 from modeharvest.idic.solver.pyramid import FULL, Level
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.scaled_eigen import ScaledEigen
@@ -190,7 +190,6 @@ class _Cost:
     unknowns: dict[str, Unknown]
     forces: Scalar | None
     strains: Scalar | None
-    by_amplitude: BoolArray
     px: float
     hold: FloatArray | None = None
     """(k,) about which coarse levels hold the unknowns; None for the finest."""
@@ -218,9 +217,10 @@ class _Cost:
                     r = float(measured - state.force) / self.forces.sd
                     found.append((r, state.force_by / self.forces.sd))
         if self.strains is not None:
-            for k in np.flatnonzero(self.by_amplitude):
-                r = float(self.strains.values[k] - states[k].strain) / self.strains.sd
-                found.append((r, states[k].strain_by / self.strains.sd))
+            for k, state in enumerate(states):
+                if f"amplitude[{k}]" in self.unknowns:
+                    r = float(self.strains.values[k] - state.strain) / self.strains.sd
+                    found.append((r, state.strain_by / self.strains.sd))
         for k, unknown in enumerate(self.unknowns.values()):
             if self.hold is not None:
                 sd = _HOLD * unknown.scale(unknown.start)
@@ -296,9 +296,7 @@ def identify(
     """
     if not any(data) and forces is None:
         raise InputError("expected images, displacements or forces to identify from, got none")
-    names = list(unknowns)
-    by_amplitude = np.array([f"amplitude[{k}]" in names for k in range(len(data))])
-    cost = _Cost(model, data, unknowns, forces, strains, by_amplitude, pixel_size)
+    cost = _Cost(model, data, unknowns, forces, strains, pixel_size)
     values = np.array([unknown.start for unknown in unknowns.values()])
     stages = list(levels) if any(isinstance(d, ImageData) for d in data) else [FULL]
     found: Minimum | None = None

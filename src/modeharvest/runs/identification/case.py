@@ -140,13 +140,8 @@ class IdentificationCase(CaseModel):
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
         if self.finer_mesh_size is not None:
-            largest = self.experiment.mesh_size
-            require_within("expected finer_mesh_size [mm]", self.finer_mesh_size, 0.0, above=True)
-            if self.finer_mesh_size >= largest:
-                raise InputError(
-                    f"expected finer_mesh_size below mesh_size ({largest:g} mm), got "
-                    f"{self.finer_mesh_size:g}"
-                )
+            what, most = "expected finer_mesh_size [mm]", 0.9 * self.experiment.mesh_size
+            require_within(what, self.finer_mesh_size, 0.0, most, above=True)
         if not self.unknowns:
             raise InputError("unknowns: expected at least one, got none")
         if (self.data is None) == (self.twin is None):
