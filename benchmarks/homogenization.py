@@ -474,10 +474,11 @@ def translations() -> None:
                 follower.follow_primary(path, (first, load), refuse_unstable=True)
                 state = path[-1]
             before = next(s for s in path if abs(s.strain - first) < 1e-12)
-            found.append([
-                critical.strain if critical else np.nan, structure.energy(before.u),
-                structure.energy(state.u), structure.reaction(state.u, specimen.length),
-            ])  # fmt: skip
+            late = structure.energy(state.u), structure.reaction(state.u, specimen.length)
+            if abs(state.strain - load) > 1e-12:  # unstable before
+                late = np.nan, np.nan
+            e = critical.strain if critical else np.nan
+            found.append([e, structure.energy(before.u), *late])
             e, *values = found[-1]
             moved = " and ".join(axis for axis, is_moved in zip("xy", shift, strict=True)
                                  if is_moved)  # fmt: skip
