@@ -474,12 +474,12 @@ def translations() -> None:
                 follower.follow_primary(path, (first, load), refuse_unstable=True)
                 state = path[-1]
             before = next(s for s in path if abs(s.strain - first) < 1e-12)
-            late = structure.energy(state.u), structure.reaction(state.u, specimen.length)
+            values = [structure.energy(before.u), structure.energy(state.u),
+                      structure.reaction(state.u, specimen.length)]  # fmt: skip
             if abs(state.strain - load) > 1e-12:  # unstable before
-                late = np.nan, np.nan
+                values[1:] = [np.nan, np.nan]
             e = critical.strain if critical else np.nan
-            found.append([e, structure.energy(before.u), *late])
-            e, *values = found[-1]
+            found.append([e, *values])
             moved = " and ".join(axis for axis, is_moved in zip("xy", shift, strict=True)
                                  if is_moved)  # fmt: skip
             name_of = f"moved along {moved}" if moved else "whole cells"
@@ -492,10 +492,11 @@ def translations() -> None:
                 spread(count), size, PARTS[size], (first, load), quarter=True
             )
             critical_strain = whole.critical.load if whole.critical else np.nan
-            early, late = whole.states
-            values = [critical_strain, early.energy, late.energy, late.force]
-            cells = compared(values, mean.tolist())
-            row(f"homogenized, {count} position(s)", *cells, late.negative_eigenvalues)
+            early, last = whole.states
+            cells = compared(
+                [critical_strain, early.energy, last.energy, last.force], mean.tolist()
+            )
+            row(f"homogenized, {count} position(s)", *cells, last.negative_eigenvalues)
 
 
 HEXAGONAL = Specimen(7, 7, 1.28, 1.386, bulk_x=0.0, bulk_y=0.0, stacking="triangular")
