@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import PrivateAttr, model_validator
@@ -35,10 +35,10 @@ class MeasuredData:
     noise_sd: float | None = None
     """Of the camera, in each image [grey levels of the files]; else estimated from the images."""
     fields: tuple[str, ...] = ()
-    """Displacement fields in mm by any DIC code, one for each strain, instead of images; origin
-    in the specimen's middle, y up."""
+    y_axis: Literal["up", "down"] | None = None
     field_sd_mm: float | None = None
-    """Their standard deviation per component."""
+    """Displacement fields in mm by any DIC code, one for each strain, instead of images, from the
+    specimen's middle; where y grows unless columns tell; standard deviation per component."""
     forces_N: tuple[float, ...] = ()
     thickness_mm: float | None = None
     forces_N_per_mm: tuple[float, ...] = ()

@@ -213,7 +213,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         assert data is not None
         if data.fields:
             assert data.field_sd_mm is not None
-            fields = [read_field(path) for path in self._files]
+            fields = [read_field(path, y_axis=data.y_axis) for path in self._files]
             measured = [
                 FieldData(f.points[f.good], f.u[f.good], data.field_sd_mm, mesh) for f in fields
             ]
