@@ -40,7 +40,7 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
-from modeharvest.runs.twin import Twin, TwinRun
+from modeharvest.runs.photographs.twin import Twin, TwinRun
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.validation.campaign import Campaign, grid
 from modeharvest.validation.workers import Workers

@@ -27,7 +27,7 @@ from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
-from modeharvest.runs.twin import whole_checks
+from modeharvest.runs.photographs.twin import whole_checks
 from modeharvest.util.errors import InputError
 from modeharvest.validation.whole_field import WholeField, compare_whole, v_percent, waves_percent
 

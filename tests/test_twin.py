@@ -20,7 +20,7 @@ from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.photographs.case import PhotographCase
-from modeharvest.runs.twin import Twin, TwinRun, make_twin
+from modeharvest.runs.photographs.twin import Twin, TwinRun, make_twin
 from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json

@@ -61,7 +61,7 @@ def run(
         if stages.case.calibration is None:
             report = experiment_report(stages.all())
         else:
-            from modeharvest.runs.twin import TwinRun
+            from modeharvest.runs.photographs.twin import TwinRun
 
             twin = TwinRun(stages.case, out, stages.progress, solution)
             report, out = photographs_report(twin.all()), out / "harvest"

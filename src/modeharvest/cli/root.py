@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand
 
-from modeharvest.cli import benchmark, commands, homogenization, identification, messages
+from modeharvest.cli import benchmark, commands, design, homogenization, identification, messages
 from modeharvest.util import __version__
 from modeharvest.util.machine import is_first
 
@@ -50,7 +50,7 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
     "An infinite lattice": (commands.bloch, commands.modes),
     "Modes in use": (homogenization.homogenize,),
     "Photographs of a test": (commands.harvest, commands.measure, identification.identify),
-    "How good a measurement is": (commands.study, benchmark.score),
+    "How good a measurement is": (design.design, commands.study, benchmark.score),
     "To begin with": (commands.cases,),
 }  # fmt: skip
 

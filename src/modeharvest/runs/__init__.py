@@ -1,7 +1,7 @@
 """Runs: a case from its TOML file to a folder of results, in stages that can be resumed.
 
 A module, or a folder, for each kind: virtual experiments, lattices, homogenized specimens,
-photographs, studies, benchmarks for DIC codes, and the twin of a real experiment.
+photographs and the twin of a real experiment, studies, designs of tests, benchmarks for DIC codes.
 """
 
 from __future__ import annotations
@@ -43,13 +43,17 @@ def run(
         from modeharvest.runs.study import StudyAnalysis, StudyCase
 
         return StudyAnalysis(StudyCase.of(case), folder, progress).all()
+    if kind == "design":
+        from modeharvest.runs.design import DesignCase, DesignRun
+
+        return DesignRun(DesignCase.of(case), folder, progress, source=source).all()
     if kind == "images":
         from modeharvest.runs.photographs.pipeline import harvest
 
         return harvest(case, folder, progress)
     experiment = Case.of(case)
     if experiment.calibration is not None:
-        from modeharvest.runs.twin import TwinRun
+        from modeharvest.runs.photographs.twin import TwinRun
 
         return TwinRun(experiment, folder, progress).all()
     from modeharvest.runs.experiment import Run

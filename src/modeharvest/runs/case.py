@@ -39,6 +39,7 @@ _KINDS = {
         "square-lattice",
     ),
     "study": ("a study", "modeharvest study {}", "noise"),
+    "design": ("the design of a test", "modeharvest design {}", "paper-virtual"),
     "images": ("photographs of a test", "modeharvest harvest {}", "photographs"),
     "experiment": ("a virtual experiment", "modeharvest run {}", "paper-virtual"),
 }

@@ -265,7 +265,7 @@ class Run(StagedRun[Case]):
         try:
             from modeharvest.fem.simulate import simulate
         except ImportError as error:
-            shipped = self._shipped()
+            shipped = self.shipped()
             if shipped is None:
                 raise MissingDependencyError(
                     f"{dolfinx_missing('the finite-element stage needs')}; or take a solution "
@@ -274,7 +274,7 @@ class Run(StagedRun[Case]):
             return shipped
         return simulate(self.case.experiment, self.progress)
 
-    def _shipped(self) -> Solution | None:
+    def shipped(self) -> Solution | None:
         """The solution that comes with the package, if it is of this very experiment."""
         for name in shipped_cases("experiment"):
             path = shipped_solution(name)

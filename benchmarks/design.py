@@ -1,0 +1,158 @@
+"""Whether a test's design foretells what its images then show.
+
+Three setups of the paper's case, far apart: images are made and exposed, correlated under several
+draws of the sensor's noise, and the scatter of what is found, and the standard deviations that the
+results report, are set against the design's, which has seen no image. Once with the displacement
+that the ansatz has of the simulated state, so that noise is all there is, and once with the
+simulated displacement itself, whose model error w lowers the curvature of the cost.
+
+Run: scripts/env python benchmarks/design.py [--seeds 10] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Snapshot, Solution
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.modes import PER_WAVE
+from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.pyramid import FULL
+from modeharvest.idic.uncertainty.covariance import propagated_sd
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.runs.case import Case, shipped_solution
+from modeharvest.validation.design import Design, DesignOptions, DesignSetup
+
+FloatArray = NDArray[np.float64]
+STRAIN = 0.128
+SETUPS: dict[str, tuple[Sensor, dict[str, float]]] = {
+    "0.04 mm/px, 2 % of read noise": (Sensor(), {"pixel_size": 0.04, "noise": 0.02}),
+    "0.02 mm/px, 1 %, speckle 0.7 times as wide": (
+        Sensor(), {"pixel_size": 0.02, "noise": 0.01, "speckle_width": 0.7},
+    ),
+    "0.03 mm/px, full well 1000, 0.5 %, half the light, 4 exposures, pixels of area": (
+        Sensor(fill_factor=1.0, psf_px=0.5, full_well=1000.0),
+        {"pixel_size": 0.03, "noise": 0.005, "light": 0.5, "exposures": 4},
+    ),
+}  # fmt: skip
+PARTS = "u", "v1", "wave numbers", "phases"
+
+
+def exposed(pair: ImagePair, design: Design, setup: DesignSetup, seed: int) -> ImagePair:
+    """The mean of some exposures of either image."""
+    bits, sensor = design.imaging.bits, design.imaging.sensor
+    sensor = replace(sensor, read_noise=setup.noise, shot_seed=seed, read_seed=seed)
+    f, g = (
+        np.mean([sensor.expose(np.float32(setup.light) * image, bits, f"{name} {k}")
+                 for k in range(int(setup.exposures))], axis=0) / (2**bits - 1)
+        for name, image in (("f", pair.reference), ("g", pair.deformed))
+    )  # fmt: skip
+    return pair.with_images(f, g)
+
+
+def sensitivities(design: Design, setup: DesignSetup) -> dict[str, FloatArray]:
+    """(..., n) derivatives of what is compared: u and v1 at points, and the modes' parameters."""
+    state = design.state(setup)
+    ansatz, a = state.ansatz, state.unknowns
+    at = design.points[design.used(0.0)][::16]
+    inside = (abs(at) <= design.specimen.cellular_half_size).all(axis=1)
+    x, y = at[inside].T[..., None]
+    v1 = np.zeros((len(x), ansatz.size))
+    v1[:, ansatz.v_slice(0)] = ansatz.v_space.basis(x, y)[:, 0]
+    waves = np.zeros((len(ansatz.modes[0].family.matrix), ansatz.size))
+    waves[:, ansatz.phi_slice(0)] = ansatz.modes[0].family.matrix
+    number = np.arange(len(waves)) % PER_WAVE
+    S = ansatz.sensitivities(a, *at.T[..., None])
+    return dict(zip(PARTS, (S, v1, waves[(number == 2) | (number == 3)], waves[number == 4]),
+                    strict=True))  # fmt: skip
+
+
+def root_mean(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def compared(design: Design, setup: DesignSetup, solution: Solution, seeds: int) -> dict[str, Any]:
+    """Scatter and reported standard deviations of some correlations, over the design's."""
+    imaging, state = design.imaging, design.state(setup)
+    spec, _ = design.speckle(setup)
+    imaging = replace(imaging, pixel_size=setup.pixel_size, speckle=spec)
+    # Light without noise and gain: irradiance; the aperture is the sensor's.
+    plain = Sensor(imaging.sensor.fill_factor, imaging.sensor.psf_px)
+    with tempfile.TemporaryDirectory() as folder:
+        made = make_images(solution, replace(imaging, sensor=plain), Path(folder), (STRAIN,))
+        pair = made.pair(STRAIN)
+    options = CorrelationOptions((FULL,), edge_px=design.correlation.edge_px)
+
+    def found(noisy: ImagePair, guess: FloatArray) -> Result:
+        return correlate(noisy, state.ansatz, guess=guess, options=options)
+
+    scale = design.imaging.sensor.gain * setup.light
+    exact = found(pair.with_images(*(np.float32(scale) * i for i in
+                                     (pair.reference, pair.deformed))), state.unknowns)  # fmt: skip
+    results = [found(exposed(pair, design, setup, s), exact.unknowns) for s in range(seeds)]
+    unknowns = np.array([result.unknowns for result in results])
+    deviations, bound = unknowns - unknowns.mean(axis=0), design.covariance(setup)
+    noise = design.image_noise(setup)
+    reported = np.mean([result.covariance(noise) for result in results], axis=0)
+    rows: dict[str, Any] = {}
+    for name, S in sensitivities(design, setup).items():
+        scatter = np.sqrt(np.sum((deviations @ S.reshape(-1, S.shape[-1]).T) ** 2, axis=0))
+        scatter /= np.sqrt(seeds - 1)
+        predicted = propagated_sd(S, bound).ravel()
+        # Alike for fields, each by its own for parameters, whose sizes differ.
+        weight = 1.0 / predicted if S.ndim == 2 and name != "v1" else np.ones_like(predicted)
+        named_sd = propagated_sd(S, reported).ravel()
+        rows[name] = {
+            "scatter": root_mean(weight * scatter) / root_mean(weight * predicted),
+            "reported": root_mean(weight * named_sd) / root_mean(weight * predicted),
+        }
+    outcomes = sorted({result.outcome.name for result in results})
+    pull = root_mean((exact.unknowns - state.unknowns)[state.ansatz.v_slice(0)])
+    return {"parts": rows, "outcomes": outcomes, "gradients": sorted(
+        {r.weighting.gradient.value for r in results}), "moved_by_w_mm": pull}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--seeds", type=int, default=10, help="draws of the noise")
+    parser.add_argument("--json", type=Path, help="where to leave all numbers")
+    options = parser.parse_args()
+    case, path = Case.read("paper-virtual"), shipped_solution("paper-virtual")
+    assert path is not None
+    solution = Solution.read(path)
+    every: dict[str, Any] = {}
+    heads = [f"{p}, {what}" for p in PARTS for what in ("scatter", "reported")]
+    print("| setup | displacement | predicted v1 [%] | " + " | ".join(heads) + " |")
+    print("|" + "---|" * (3 + len(heads)))
+    for name, (sensor, changed) in SETUPS.items():
+        imaging = replace(case.imaging, sensor=sensor)
+        design = Design(case.experiment.specimen, imaging, case.correlation, DesignOptions(),
+                        STRAIN, solution)  # fmt: skip
+        setup = replace(design.setup, **changed)
+        state, expected = design.state(setup), design.expected(setup)
+        own = state.ansatz.displacement_at(state.unknowns, solution.mesh.nodes)
+        inside = Solution(solution.mesh, (Snapshot(STRAIN, own),), solution.info)
+        for kind, shown in (("the ansatz'", inside), ("simulated", solution)):
+            row = compared(design, setup, shown, options.seeds)
+            every[f"{name}, {kind}"] = {**row, "expected": asdict(expected)}
+            cells = " | ".join(
+                f"{part[what]:.3f}" for part in row["parts"].values() for what in part
+            )
+            print(f"| {name} | {kind} | {expected.v1_percent:.4f} | {cells} |", flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(every, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

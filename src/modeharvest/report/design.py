@@ -1,0 +1,136 @@
+"""Report of a test's design: errors to expect, what is needed for the wanted ones, and a map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from modeharvest.report.figures.curves import curve, plain_ticks
+from modeharvest.report.figures.style import INK, SIZE
+from modeharvest.report.model import (
+    Card,
+    KeyNumber,
+    Report,
+    ReportTable,
+    Section,
+    caption,
+    number,
+    text_of,
+)
+from modeharvest.util.files import write_csv
+from modeharvest.util.typed import headings
+from modeharvest.validation.design import DesignRanges, ExpectedErrors
+
+Summary = Mapping[str, Any]
+_ERRORS, _AXES = headings(ExpectedErrors), headings(DesignRanges)
+_WITHIN = 0.5
+"""Model error that is this share of what noise makes would hardly show beside it."""
+
+
+def design_report(summary: Summary) -> Report:
+    """The report of a design; ``summary``: the content of ``summary.json``."""
+    varied = [
+        ReportTable(f"Varied: {_AXES[axis]}", [_AXES[axis], *_ERRORS.values()],
+                    [[row["value"], *(row[name] for name in _ERRORS)] for row in rows])
+        for axis, rows in summary["varied"].items() if rows
+    ]  # fmt: skip
+    shown, wanted = summary["map"], summary["wanted"]
+    labels = [*(_AXES[axis] for axis in shown["axes"]), _ERRORS[shown["contour"]]]
+    level = wanted[shown["contour"]]
+    picture = partial(_draw_map, shown, level, labels)
+    words = {"quantity": labels[2], "level": number(level)}
+    return Report(
+        kind="design",
+        title=summary["title"],
+        findings=findings(summary),
+        keys=[
+            KeyNumber.of(f"design-{name}", number(float(summary["expected"][name]), 3))
+            for name in ("v1_percent", "v1_px", "wave_number", "phase", "image_noise")
+        ],
+        sections=[
+            Section.of("design-needed", Card.tabular(_needed(summary), wide=True)),
+            Section.of("design-map", [Card.captioned("design-map", picture, **words)]),
+            Section.of("design-varied",
+                       [card for table in varied for card in Card.tabular(table, wide=True)]),
+        ],
+        warnings=_warnings(summary),
+        notes=[text_of(f"design-{name}") for name in ("noise", "speckle", "strain", "material")],
+        command=summary["command"],
+        case=summary["case"],
+        files={"design.csv": "every value of what was varied, with its errors"},
+        versions=summary["versions"],
+        **caption("page-design"),
+    )  # fmt: skip
+
+
+def findings(summary: Summary) -> list[str]:
+    """What is to be expected, in sentences."""
+    expected, wanted = summary["expected"], summary["wanted"]
+    text = [text_of("design-expected", **expected, setup=summary["setup"])]
+    missed = [name for name in wanted if expected[name] > wanted[name]]
+    if missed:
+        which = "; ".join(f"{_ERRORS[name]}: {number(wanted[name])}" for name in missed)
+        text.append(text_of("design-missed", which=which))
+    else:
+        text.append(text_of("design-met"))
+    return text
+
+
+def _warnings(summary: Summary) -> list[str]:
+    """That model error is no noise, wherever it would show."""
+    expected = summary["expected"]
+    w, u = expected["w_px"], expected["u_px"]
+    if w is None:
+        return [text_of("design-no-truth")]
+    return [text_of("design-model-error", w=w, times=w / u)] if w > _WITHIN * u else []
+
+
+def _needed(summary: Summary) -> ReportTable:
+    """What each wanted error needs of each thing, and what the case has."""
+    wanted, setup, varied = summary["wanted"], summary["setup"], summary["varied"]
+    rows = []
+    for axis, values in summary["needed"].items():
+        if not varied[axis]:
+            continue
+        low, high = (number(varied[axis][k]["value"]) for k in (0, -1))
+        sign, easiest = ("≥", low) if axis in ("exposures", "light") else ("≤", high)
+        found = [number(values[name], 3) for name in wanted]
+        cells = [
+            f"not within {low} … {high}" if values[name] is None
+            else f"any, {low} … {high}" if text == easiest else f"{sign} {text}"
+            for name, text in zip(wanted, found, strict=True)
+        ]  # fmt: skip
+        rows.append([_AXES[axis], setup[axis], *cells])
+    heads = [f"{_ERRORS[name]}: {number(value)}" for name, value in wanted.items()]
+    title = caption("table-design-needed")["title"]
+    return ReportTable(title, ["varied", "as in the case", *heads], rows, on_terminal=True)
+
+
+def _draw_map(shown: Mapping[str, Any], wanted: float, labels: list[str]) -> Figure:
+    """Draw the map with a line where the error is as wanted, if it is anywhere."""
+    drawn, axes = curve(labels[0], labels[1], (6.4, 3.6))
+    at, errors = (shown["first"], shown["second"]), np.array(shown["errors"])
+    looks: dict[str, Any] = {"norm": LogNorm(), "cmap": SIZE, "shading": "gouraud"}
+    colours = axes.pcolormesh(*at, errors, rasterized=True, **looks)
+    axes.set(xscale="log", yscale="log")
+    if errors.min() < wanted < errors.max():
+        line = axes.contour(*at, errors, levels=[wanted], colors=["white"])
+        axes.clabel(line, fmt=f"{wanted:g}", fontsize=8)
+    axes.grid(visible=False)
+    bar = drawn.colorbar(colours, ax=axes)
+    bar.set_label(labels[2], color=INK)
+    plain_ticks(axes.xaxis, axes.yaxis, bar.ax.yaxis)
+    return drawn
+
+
+def write_varied(summary: Summary, path: Path) -> None:
+    """Write every value of what was varied, with its errors, as CSV."""
+    rows = [[_AXES[axis], row["value"], *(row[name] for name in _ERRORS)]
+            for axis, rows in summary["varied"].items() for row in rows]  # fmt: skip
+    write_csv(path, ["varied", "value", *_ERRORS.values()], rows)

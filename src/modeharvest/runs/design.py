@@ -1,0 +1,96 @@
+"""The design of a test, from a case to its report: what noise will leave uncertain, and what helps.
+
+A case is a virtual experiment's, and may have a table ``[design]``. It takes seconds, so nothing is
+kept but what it leaves: ``summary.json``, ``report.html``, ``design.csv``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from modeharvest.fem.field import Solution
+from modeharvest.runs.case import Case, checked, read_tables, table_of_kind
+from modeharvest.runs.experiment import Run
+from modeharvest.util.files import require_writable, write_json
+from modeharvest.util.stages import StagedRun, exclusive, versions
+from modeharvest.util.typed import to_plain
+from modeharvest.validation.design import AXES, NEEDED, WANTED, Design, DesignOptions
+
+
+class DesignCase(Case):
+    """A virtual experiment, and what its photographs are wanted for."""
+
+    table = "design"
+
+    design: DesignOptions = DesignOptions()
+
+    @classmethod
+    def read(cls, name: str | Path) -> Self:
+        """Read a design, or a virtual experiment, which is designed with the defaults."""
+        tables = read_tables(name, "paper-virtual")
+        if table_of_kind(tables) == "experiment":
+            return checked(cls, tables, name)
+        return super().read(name)
+
+
+@dataclass(frozen=True)
+class DesignRun(StagedRun[DesignCase]):
+    """The work of a design."""
+
+    solution: Path | None = None
+    """A solution file instead of the case's shipped one, or of simulating."""
+    source: str = "CASE"
+    """The case's name, for the report."""
+
+    def design(self) -> Design:
+        """What says how large errors will be; simulates the test unless its solution is known."""
+        case, strains = self.case, self.case.experiment.strains
+        strain, how = case.design.strain or strains[-1], (case.imaging, case.correlation)
+        solution = self._solved() if case.design.pattern is None else None
+        return Design(case.experiment.specimen, *how, case.design, strain, solution)
+
+    def all(self) -> dict[str, Any]:
+        """Leave summary, table and report; returns the content of ``summary.json``."""
+        from modeharvest.report.design import design_report, write_varied
+        from modeharvest.report.model import write_page
+
+        require_writable(self.folder)
+        with exclusive(self.folder):
+            summary = self.summary(self.design())
+            write_varied(summary, self.folder / "design.csv")
+            write_json(self.folder / "summary.json", summary)
+            write_page(design_report(summary), self.folder / "report.html", self.progress)
+        return summary
+
+    def summary(self, design: Design) -> dict[str, Any]:
+        """The content of ``summary.json``: docs/design.md."""
+        setup, options, state = design.setup, design.options, design.state(design.setup)
+        varied = {
+            axis: [{"value": value, **asdict(errors)} for value, errors in design.varied(axis)]
+            for axis in AXES
+        }
+        first, second, errors = design.mapped()
+        found = {
+            "title": self.case.title or "Design of a test",
+            "command": f"modeharvest design {self.source} --out {self.folder}",
+            "critical_strain": design.critical,
+            "setup": setup,
+            "expected": design.expected(setup),
+            "wanted": {name: getattr(options, name) for name in WANTED},
+            "needed": {axis: {n: design.needed(axis, n) for n in WANTED} for axis in NEEDED},
+            "varied": varied,
+            "map": {
+                "axes": options.map, "contour": options.contour,
+                "first": first, "second": second, "errors": errors,
+            },
+            "unknowns": state.ansatz.size,
+            "case": {**self.case.plain(), "design": options},
+            "versions": versions("numpy", "scipy"),
+        }  # fmt: skip
+        return dict(to_plain(found))
+
+    def _solved(self) -> Solution:
+        run = Run(self.case, self.folder, self.progress, self.solution)
+        return (None if self.solution else run.shipped()) or run.solved()
