@@ -139,9 +139,9 @@ class Identified:
     @property
     def statements(self) -> tuple[str, ...]:
         """What the data don't determine, and which unknowns are at their bounds, in words."""
-        names, scales = list(self.unknowns), self._scales
-        found = []
+        names, scales, found = list(self.unknowns), list[float](), list[str]()
         for name, unknown, value in zip(names, self.unknowns.values(), self.values, strict=True):
+            scales.append(unknown.scale(value))
             low, high = unknown.bounds
             if min(value - low, high - value) < 1e-3 * (high - low):
                 found.append(
@@ -174,11 +174,6 @@ class Identified:
                 f"combinations than their relative changes ({parts}) together ({how}){hint}"
             )
         return tuple(found)
-
-    @property
-    def _scales(self) -> FloatArray:
-        pairs = zip(self.unknowns.values(), self.values, strict=True)
-        return np.array([unknown.scale(value) for unknown, value in pairs])
 
 
 @dataclass(eq=False)
@@ -298,7 +293,8 @@ def identify(
         raise InputError("expected images, displacements or forces to identify from, got none")
     cost = _Cost(model, data, unknowns, forces, strains, pixel_size)
     values = np.array([unknown.start for unknown in unknowns.values()])
-    stages = list(levels) if any(isinstance(d, ImageData) for d in data) else [FULL]
+    # The last one twice: where material ends in the deformed image is known by the model alone.
+    stages = [*levels, levels[-1]] if any(isinstance(d, ImageData) for d in data) else [FULL]
     found: Minimum | None = None
     for number, level in enumerate(stages):
         progress(number, len(stages), "identify")
@@ -311,9 +307,6 @@ def identify(
         values = found.unknowns
     assert found is not None
     progress(len(stages), len(stages), "identify")
-    for part, state in zip(data, cost.states(values), strict=True):
-        if part is not None:
-            part.prepare(FULL, state)  # weights of the state that was found
     states, off = cost.states(values), np.zeros_like(values)
     if finer is not None:
         begin = values

@@ -23,7 +23,7 @@ from modeharvest.idic.finite_element.pixels import (
 from modeharvest.idic.finite_element.result import local_coordinates
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise
-from modeharvest.idic.solver.pyramid import FULL, Level
+from modeharvest.idic.solver.pyramid import FULL, Level, eroded
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate, locate_points
 from modeharvest.imaging.pair import ImagePair
@@ -34,8 +34,8 @@ from modeharvest.util.errors import InputError
 if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
     from modeharvest.fem.path.parametric import ParametricState as ModelState
 
-_EDGE_PX = 3
-"""Left out at edges: between them and the material the deformed image's spline reads background."""
+_EDGE_PX = 2
+"""Left out at edges: with 1 px more is known, but what g is continued by shows."""
 _LEAST_DET = 0.1
 _MOST_NOISE = 0.9  # of the mean square slope
 _ALONG = 8
@@ -86,8 +86,12 @@ class ImageData:
 
     def prepare(self, level: Level, state: ModelState) -> None:
         """Images of a level; on a coarse one what the residual is weighs it, not its noise."""
-        order = self.order if level == FULL else 5
-        self._images = images_on(self.pair, level, _EDGE_PX, order)
+        order, mesh, pair = self.order if level == FULL else 5, self.pixels.mesh, self.pair
+        if level == FULL:  # beyond the material that the model shows there, g is continued
+            at = mesh.nodes + state.displacement
+            shown = locate(at, mesh.cells, mesh.element, pair.grid, "deformed mesh").mask
+            pair = replace(pair, deformed_mask=pair.masks[1] & eroded(shown, 1))
+        self._images = images_on(pair, level, _EDGE_PX, order)
         images = self._images
         self._own = self.pixels.on(images.grid, images.mask, images.reference)
         self._weight, self._level = 1.0, level
@@ -99,7 +103,7 @@ class ImageData:
             self._expected = sums.rms
             self._weight = 1.0 / (sums.rms**2 * max(1.0, 4.0 * np.pi * level.blur**2))
             return
-        mesh, u, px = self.pixels.mesh, state.displacement, self.pair.grid.pixel_size
+        u, px = state.displacement, self.pair.grid.pixel_size
         gradients = element_gradients(mesh, u)
         det = np.maximum(determinant(np.eye(2) + gradients.mean(axis=1)), _LEAST_DET)
         transfer = NoiseTransfer.at(u[mesh.cells].mean(axis=1) / px, det, self.order)
