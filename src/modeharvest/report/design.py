@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from modeharvest.report.model import (
     number,
     text_of,
 )
-from modeharvest.util.files import write_csv
 from modeharvest.util.typed import headings
 from modeharvest.validation.design import DesignRanges, ExpectedErrors
 
@@ -44,6 +42,8 @@ def design_report(summary: Summary) -> Report:
     labels = [*(_AXES[axis] for axis in shown["axes"]), _ERRORS[shown["contour"]]]
     level = wanted[shown["contour"]]
     picture = partial(_draw_map, shown, level, labels)
+    w, u = summary["expected"]["w_px"] or 0.0, summary["expected"]["u_px"]
+    limit = "model-error" if w > _WITHIN * u else "" if w else "no-truth"
     words = {"quantity": labels[2], "level": number(level)}
     return Report(
         kind="design",
@@ -59,11 +59,10 @@ def design_report(summary: Summary) -> Report:
             Section.of("design-varied",
                        [card for table in varied for card in Card.tabular(table, wide=True)]),
         ],
-        warnings=_warnings(summary),
+        warnings=[text_of(f"design-{limit}", w=w, times=w / u)] if limit else [],
         notes=[text_of(f"design-{name}") for name in ("noise", "speckle", "strain", "material")],
         command=summary["command"],
         case=summary["case"],
-        files={"design.csv": "every value of what was varied, with its errors"},
         versions=summary["versions"],
         **caption("page-design"),
     )  # fmt: skip
@@ -73,6 +72,9 @@ def findings(summary: Summary) -> list[str]:
     """What is to be expected, in sentences."""
     expected, wanted = summary["expected"], summary["wanted"]
     text = [text_of("design-expected", **expected, setup=summary["setup"])]
+    sensor = summary["case"]["imaging"]["sensor"]
+    if not sensor["read_noise"] and not sensor["full_well"]:
+        text.append(text_of("design-assumed", noise=summary["setup"]["noise"]))
     missed = [name for name in wanted if expected[name] > wanted[name]]
     if missed:
         which = "; ".join(f"{_ERRORS[name]}: {number(wanted[name])}" for name in missed)
@@ -80,15 +82,6 @@ def findings(summary: Summary) -> list[str]:
     else:
         text.append(text_of("design-met"))
     return text
-
-
-def _warnings(summary: Summary) -> list[str]:
-    """That model error is no noise, wherever it would show."""
-    expected = summary["expected"]
-    w, u = expected["w_px"], expected["u_px"]
-    if w is None:
-        return [text_of("design-no-truth")]
-    return [text_of("design-model-error", w=w, times=w / u)] if w > _WITHIN * u else []
 
 
 def _needed(summary: Summary) -> ReportTable:
@@ -127,10 +120,3 @@ def _draw_map(shown: Mapping[str, Any], wanted: float, labels: list[str]) -> Fig
     bar.set_label(labels[2], color=INK)
     plain_ticks(axes.xaxis, axes.yaxis, bar.ax.yaxis)
     return drawn
-
-
-def write_varied(summary: Summary, path: Path) -> None:
-    """Write every value of what was varied, with its errors, as CSV."""
-    rows = [[_AXES[axis], row["value"], *(row[name] for name in _ERRORS)]
-            for axis, rows in summary["varied"].items() for row in rows]  # fmt: skip
-    write_csv(path, ["varied", "value", *_ERRORS.values()], rows)

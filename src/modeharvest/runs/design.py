@@ -1,7 +1,6 @@
 """The design of a test, from a case to its report: what noise will leave uncertain, and what helps.
 
-A case is a virtual experiment's, and may have a table ``[design]``. It takes seconds, so nothing is
-kept but what it leaves: ``summary.json``, ``report.html``, ``design.csv``.
+A case is a virtual experiment's, and may have a table ``[design]``.
 """
 
 from __future__ import annotations
@@ -52,14 +51,13 @@ class DesignRun(StagedRun[DesignCase]):
         return Design(case.experiment.specimen, *how, case.design, strain, solution)
 
     def all(self) -> dict[str, Any]:
-        """Leave summary, table and report; returns the content of ``summary.json``."""
-        from modeharvest.report.design import design_report, write_varied
+        """Leave summary and report; returns the content of ``summary.json``."""
+        from modeharvest.report.design import design_report
         from modeharvest.report.model import write_page
 
         require_writable(self.folder)
         with exclusive(self.folder):
             summary = self.summary(self.design())
-            write_varied(summary, self.folder / "design.csv")
             write_json(self.folder / "summary.json", summary)
             write_page(design_report(summary), self.folder / "report.html", self.progress)
         return summary
@@ -67,11 +65,9 @@ class DesignRun(StagedRun[DesignCase]):
     def summary(self, design: Design) -> dict[str, Any]:
         """The content of ``summary.json``: docs/design.md."""
         setup, options, state = design.setup, design.options, design.state(design.setup)
-        varied = {
-            axis: [{"value": value, **asdict(errors)} for value, errors in design.varied(axis)]
-            for axis in AXES
-        }
+        varied = {x: [{"value": v, **asdict(e)} for v, e in design.varied(x)] for x in AXES}
         first, second, errors = design.mapped()
+        shown = {"first": first, "second": second, "errors": errors}
         found = {
             "title": self.case.title or "Design of a test",
             "command": f"modeharvest design {self.source} --out {self.folder}",
@@ -81,14 +77,11 @@ class DesignRun(StagedRun[DesignCase]):
             "wanted": {name: getattr(options, name) for name in WANTED},
             "needed": {axis: {n: design.needed(axis, n) for n in WANTED} for axis in NEEDED},
             "varied": varied,
-            "map": {
-                "axes": options.map, "contour": options.contour,
-                "first": first, "second": second, "errors": errors,
-            },
+            "map": {"axes": options.map, "contour": options.contour, **shown},
             "unknowns": state.ansatz.size,
             "case": {**self.case.plain(), "design": options},
             "versions": versions("numpy", "scipy"),
-        }  # fmt: skip
+        }
         return dict(to_plain(found))
 
     def _solved(self) -> Solution:
