@@ -92,6 +92,8 @@ class ImageData:
             shown = locate(at, mesh.cells, mesh.element, pair.grid, "deformed mesh").mask
             pair = replace(pair, deformed_mask=pair.masks[1] & eroded(shown, 1))
         self._images = images_on(pair, level, _EDGE_PX, order)
+        if level == FULL:  # no pixel comes or goes on the way: the cost would jump
+            self._images = replace(self._images, valid=None)
         images = self._images
         self._own = self.pixels.on(images.grid, images.mask, images.reference)
         self._weight, self._level = 1.0, level
