@@ -7,7 +7,10 @@ that the ansatz has of the simulated state, so that noise is all there is, and o
 simulated displacement itself, whose model error w lowers the curvature of the cost. What w itself
 does is how far v1 is off without noise, beside the best fit.
 
-Run: scripts/env python benchmarks/design.py [--seeds 30] [--json FILE]
+With --strains the test is simulated at four strains beyond buckling, and the errors by these states
+are set against those that the design has from the last one by the root law of a pitchfork.
+
+Run: scripts/env python benchmarks/design.py [--seeds 30] [--json FILE] [--strains]
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.runs.case import Case, shipped_solution
-from modeharvest.validation.design import Design, DesignOptions, DesignSetup
+from modeharvest.validation.design import WANTED, Design, DesignOptions, DesignSetup
 
 FloatArray = NDArray[np.float64]
 STRAIN = 0.128
@@ -128,12 +131,37 @@ def compared(design: Design, setup: DesignSetup, solution: Solution, seeds: int)
     }
 
 
+def other_strains(case: Case) -> None:
+    """Print the errors of simulated states over those of the design's root law."""
+    from modeharvest.fem.simulate import simulate
+
+    strains = DesignOptions().ranges.strain
+    solution = simulate(replace(case.experiment, strains=strains))
+    names = ("u_px", "v1_px", *WANTED)
+
+    def designed(strain: float) -> Design:
+        how = case.experiment.specimen, case.imaging, case.correlation, DesignOptions()
+        return Design(*how, strain, solution)
+
+    last = designed(strains[-1])
+    print("| strain [%] | w [px] | " + " | ".join(names) + " |\n" + "|---" * (2 + len(names)) + "|")
+    for strain in strains[:-1]:
+        own, law = designed(strain), last.expected(replace(last.setup, strain=strain))
+        errors = own.expected(own.setup)
+        ratios = (f"{getattr(errors, name) / getattr(law, name):.3f}" for name in names)
+        print(f"| {100 * strain:g} | {errors.w_px:.2f} | " + " | ".join(ratios) + " |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--seeds", type=int, default=30, help="draws of the noise")
     parser.add_argument("--json", type=Path, help="where to leave all numbers")
+    parser.add_argument("--strains", action="store_true", help="the root law instead")
     options = parser.parse_args()
     case, path = Case.read("paper-virtual"), shipped_solution("paper-virtual")
+    if options.strains:
+        other_strains(case)
+        return
     assert path is not None
     solution = Solution.read(path)
     every: dict[str, Any] = {}

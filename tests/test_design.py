@@ -256,6 +256,7 @@ def test_the_paper_s_case_is_designed_as_it_is_shipped(
     strains, phases = zip(*((row["value"], row["phase"]) for row in varied["strain"]), strict=True)
     assert strains == (0.1, 0.11, 0.12, 0.128)
     assert list(phases) == sorted(phases, reverse=True)
+    assert [row["w_px"] is None for row in varied["strain"]] == [True, True, True, False]
     errors = np.array(summary["map"]["errors"])
     assert (np.diff(errors, axis=0) > 0).all()
     assert (np.diff(errors, axis=1) > 0).all()

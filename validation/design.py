@@ -138,8 +138,8 @@ class ExpectedErrors:
     phase: float = quantity("phases, largest", "mm")
     image_noise: float = quantity("noise of an image", "% of full scale")
     w_px: float | None = quantity("model error, rms", "px")
-    """What the ansatz leaves of the simulated displacement: no part of the others. None if the
-    pattern was given."""
+    """What the ansatz leaves of the simulated displacement: no part of the others. None if that
+    was not simulated: a pattern that was given, another strain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +254,7 @@ class Design:
         a, slow = found.unknowns.copy(), found.ansatz.v0_slice(1).stop
         a[:slow] *= setup.strain / own
         a[slow : found.ansatz.phi_offset(0)] *= ((setup.strain - least) / (own - least)) ** 0.5
-        return replace(found, unknowns=a)
+        return replace(found, unknowns=a, w=None)
 
     def signal(self, setup: DesignSetup) -> float:
         """G/(2 p⁴ s²) [1/mm⁴], which the integral is multiplied by."""

@@ -21,8 +21,8 @@ def run(
     """Run a case of any kind, from its options to its report; what is finished is not done again.
 
     ``case``: a shipped case's name, the path of a TOML file, or the case itself: a virtual
-    experiment, the twin of a real one, a lattice, a homogenized specimen, a study, or photographs.
-    ``folder``: where to leave the files. Returns the content of ``summary.json``.
+    experiment, the twin of a real one, a lattice, a homogenized specimen, a design, a study, or
+    photographs. ``folder``: where to leave the files. Returns the content of ``summary.json``.
     """
     from modeharvest.runs.case import Case, CaseModel, read_tables, table_of_kind
 
