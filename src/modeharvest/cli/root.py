@@ -117,7 +117,7 @@ def main() -> None:
 def _run() -> None:
     try:
         try:
-            sys.exit(app(prog_name="modeharvest", standalone_mode=False))
+            sys.exit(app(prog_name="modeharvest", standalone_mode=False) or 0)
         finally:
             sys.stdout.flush()  # a full disk shows now or never
     except SystemExit:
