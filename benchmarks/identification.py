@@ -23,7 +23,7 @@ from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.finite_element.identify import Scalar, Unknown, identify
+from modeharvest.idic.finite_element.identify import Readings, Unknown, identify
 from modeharvest.idic.finite_element.observed import FieldData, ImageData, nodal_values
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.noise import ImageNoise
@@ -71,14 +71,14 @@ def by_mesh() -> None:
     hole = SPECIMEN.pitch * (np.round(points / SPECIMEN.pitch - 0.5) + 0.5)  # the nearest one
     points = points[np.linalg.norm(points - hole, axis=1) > 0.5 * SPECIMEN.diameter + 0.02]
     fields = [nodal_values(fine.mesh, s.displacement, points) for s in states]
-    forces = Scalar(np.array([s.force for s in states]), 0.002)
+    forces = Readings(np.array([s.force for s in states]), 0.002)
     print("| elements [mm] | modulus | exponent | kappa | residual, last state [um] |")
     print("|---|---|---|---|---|")
     for size in (0.35, 0.25, 0.2, 0.15):
         model = test(size)
         data = [FieldData(points, u, 5e-4, model.mesh) for u in fields]
         found = identify(model.at, data, UNKNOWNS, pixel_size=0.03, forces=forces)
-        row = (f"{v:.4g}" for v in (*found.values[:3], 1e3 * found.sums[-1].residual))
+        row = (f"{v:.4g}" for v in (*found.values[:3], 1e3 * found.state_equations[-1].residual))
         print("|", size, "|", " | ".join(row), "|", flush=True)
 
 
@@ -113,7 +113,7 @@ def by_seed(how: argparse.Namespace) -> None:
                 ImageData(ImagePair(noisy[0], g, images.grid), pixels, ImageNoise(NOISE, NOISE))
                 for g in noisy[1:]
             ]
-            readings = Scalar(forces + rng.normal(0.0, force_sd, len(forces)), force_sd)
+            readings = Readings(forces + rng.normal(0.0, force_sd, len(forces)), force_sd)
             found = identify(model.at, data, UNKNOWNS, pixel_size=how.pixel_size, forces=readings)
             errors.append((found.values - true) / found.sd)
             inside.append(abs(found.values - true) < 1.96 * found.sd)

@@ -17,7 +17,7 @@ from modeharvest.idic.finite_element.identify import (
     LEVELS,
     FinerMesh,
     Identified,
-    Scalar,
+    Readings,
     Unknown,
     identify,
 )
@@ -110,12 +110,12 @@ UNKNOWNS = {
     "b": Unknown(-0.3, (-2.0, 2.0)),
     "c": Unknown(1.0, (0.1, 9.0)),
 }
-FORCES = Scalar(np.array([e * TRUE[0] * TRUE[2] for e in LOADS]), 1e-3)
+FORCES = Readings(np.array([e * TRUE[0] * TRUE[2] for e in LOADS]), 1e-3)
 
 
 def found_from(seed: int, **more: object) -> Identified:
     rng = np.random.default_rng(1000 + seed)
-    readings = Scalar(FORCES.values + rng.normal(0.0, FORCES.sd, 2), FORCES.sd)
+    readings = Readings(FORCES.values + rng.normal(0.0, FORCES.sd, 2), FORCES.sd)
     given = {"forces": readings, "pixel_size": GRID.pixel_size, **more}
     return identify(model, images(seed), UNKNOWNS, **given)  # type: ignore[arg-type]
 
@@ -131,7 +131,7 @@ def test_errors_are_what_their_standard_deviations_predict() -> None:
             same = found_from(seed, levels=(FULL,)).values
             assert np.all(np.abs(found.values - same) < 0.05 * found.sd)
             assert found.statements == ()
-            for share in found.sums:
+            for share in found.state_equations:
                 assert share.residual == pytest.approx(share.expected, rel=0.02)
     assert 19.0 < sum(every) < 59.0  # 1 % and 99 % of chi squared of 36 degrees
 
@@ -142,10 +142,10 @@ def test_the_gradient_is_the_cost_s() -> None:
     values = TRUE * [1.02, 1.05, 1.0]
     for data, k in ((states[1], 1),):
         data.prepare(FULL, model(values)[k])
-        here = data.sums(model(values)[k])
+        here = data.equations(model(values)[k])
         for i, step in enumerate((1e-5, 1e-4)):
             h = np.eye(3)[i] * step
-            cost = [0.5 * data.sums(model(values + s * h)[k]).squares for s in (1.0, -1.0)]
+            cost = [0.5 * data.equations(model(values + s * h)[k]).squares for s in (1.0, -1.0)]
             slope = (cost[0] - cost[1]) / (2 * step)
             assert here.blocks.sum(axis=0)[i] == pytest.approx(slope, rel=1e-3)
 

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from modeharvest.idic.finite_element.observed import ImageData, StateData, Sums
+from modeharvest.idic.finite_element.observed import ImageData, StateEquations, StateObservation
 from modeharvest.idic.solver.assembly import NormalEquations
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, minimise
 from modeharvest.idic.solver.pyramid import FULL, Level
+from modeharvest.idic.uncertainty.parameters import undetermined_combinations
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -38,10 +39,6 @@ some of them hardly, and far off the model is another one."""
 _ROUNDS = 4  # of steps with a finer mesh's residual, at most
 _SETTLED = 0.1  # standard errors, rms: of the last of them
 _UNLIKE = 1.5  # times what noise alone makes: a residual that says so
-_LARGE = 0.2
-"""Relative standard deviation of a combination of unknowns beyond which words say so."""
-_PART = 0.3
-"""Of a unit eigenvector: which unknowns a combination is of."""
 
 
 Model = Callable[[FloatArray], "Sequence[ModelState]"]
@@ -83,7 +80,7 @@ class Unknown:
 
 
 @dataclass(frozen=True, eq=False)
-class Scalar:
+class Readings:
     """A reading of one number of each state: forces [N/mm] or nominal strains [-]."""
 
     values: FloatArray
@@ -104,14 +101,14 @@ class Identified:
     forces and strains at least their noise."""
     minimum: Minimum
     states: list[ModelState]
-    sums: list[Sums]
+    state_equations: list[StateEquations]
     """Of the states, which are those of ``minimum.unknowns``."""
     evaluations: int
     """How often the model was solved."""
     mesh_error: FloatArray
     """(k,) taken for what the finer mesh leaves, and added to the values: from how far it moved
     them, as errors go with the square of the elements' size; 0 where there was no finer mesh."""
-    forces: Scalar | None = None
+    forces: Readings | None = None
 
     @property
     def sd(self) -> FloatArray:
@@ -139,40 +136,24 @@ class Identified:
     @property
     def statements(self) -> tuple[str, ...]:
         """What the data don't determine, and which unknowns are at their bounds, in words."""
-        names, scales, found = list(self.unknowns), list[float](), list[str]()
-        for name, unknown, value in zip(names, self.unknowns.values(), self.values, strict=True):
+        scales, found = list[float](), list[str]()
+        for (name, unknown), value in zip(self.unknowns.items(), self.values, strict=True):
             scales.append(unknown.scale(value))
             low, high = unknown.bounds
             if min(value - low, high - value) < 1e-3 * (high - low):
                 found.append(
                     f"{name} is at its bound: the data may want it beyond [{low:g}, {high:g}]"
                 )
-        for state, share in zip(self.states, self.sums, strict=False):
+        for state, share in zip(self.states, self.state_equations, strict=False):
             if share.residual > _UNLIKE * share.expected:
                 found.append(
                     f"at {100 * state.strain:.4g} % the residual is {share.residual:.3g}, "
                     f"{share.residual / share.expected:.2g} times what noise makes: the model, its "
                     "branch or its mesh is not the specimen's, or this is a local minimum"
                 )
-        H = self.minimum.equations.matrix * np.outer(scales, scales)
-        squares, vectors = np.linalg.eigh(H)
-        with np.errstate(divide="ignore"):
-            sizes = 1.0 / np.sqrt(np.maximum(squares, 0.0))
-        hint = "" if self.forces is not None else ": add a force"
-        for size, vector in zip(sizes, vectors.T, strict=True):
-            if size < _LARGE:
-                continue
-            own = [k for k in np.argsort(-abs(vector)) if abs(vector[k]) > _PART]
-            vector = vector * np.sign(vector[own[0]])
-            how = "nothing determines it" if size > 1e3 else f"known to {100 * size:.2g} %"
-            if len(own) == 1:
-                found.append(f"{names[own[0]]} is hardly determined ({how}){hint}")
-                continue
-            parts = ", ".join(f"{vector[k]:+.2f} {names[k]}" for k in own)
-            found.append(
-                f"{' and '.join(names[k] for k in sorted(own))} are determined only in other "
-                f"combinations than their relative changes ({parts}) together ({how}){hint}"
-            )
+        remedy = "" if self.forces is not None else ": add a force"
+        matrix = self.minimum.equations.matrix
+        found += undetermined_combinations(list(self.unknowns), matrix, scales, remedy)
         return tuple(found)
 
 
@@ -181,10 +162,10 @@ class _Cost:
     """The cost and its normal equations, of the data of one level."""
 
     model: Model
-    data: Sequence[StateData | None]
+    data: Sequence[StateObservation | None]
     unknowns: dict[str, Unknown]
-    forces: Scalar | None
-    strains: Scalar | None
+    forces: Readings | None
+    strains: Readings | None
     px: float
     hold: FloatArray | None = None
     """(k,) about which coarse levels hold the unknowns; None for the finest."""
@@ -199,9 +180,9 @@ class _Cost:
             self._states = {**dict(list(self._states.items())[-2:]), key: list(self.model(values))}
         return self._states[key]
 
-    def shares(self, states: Sequence[ModelState]) -> list[Sums]:
+    def state_equations(self, states: Sequence[ModelState]) -> list[StateEquations]:
         """Of the states with images or displacements."""
-        return [data.sums(s) for data, s in zip(self.data, states, strict=True) if data]
+        return [data.equations(s) for data, s in zip(self.data, states, strict=True) if data]
 
     def scalars(self, states: Sequence[ModelState], values: FloatArray) -> list[tuple[float, Any]]:
         """Residuals of forces, strains and priors over their standard deviations, with -dr/dp."""
@@ -245,7 +226,7 @@ class _Cost:
         matrix: FloatArray = np.zeros((len(values),) * 2)
         gradient: FloatArray = np.zeros(len(values))
         squares, number = 0.0, 0
-        for share in self.shares(states):
+        for share in self.state_equations(states):
             matrix, gradient = matrix + share.matrix, gradient + share.blocks.sum(axis=0)
             squares, number = squares + share.squares, number + share.count
         for r, J in self.scalars(states, values):
@@ -268,12 +249,12 @@ class _Cost:
 
 def identify(
     model: Model,
-    data: Sequence[StateData | None],
+    data: Sequence[StateObservation | None],
     unknowns: dict[str, Unknown],
     *,
     pixel_size: float,
-    forces: Scalar | None = None,
-    strains: Scalar | None = None,
+    forces: Readings | None = None,
+    strains: Readings | None = None,
     levels: Sequence[Level] = LEVELS,
     finer: FinerMesh | None = None,
     progress: Progress = silent,
@@ -343,7 +324,7 @@ def _assessed(
     """The result, with its covariances: by noise, and by the residual from block to block."""
     found = replace(found, equations=cost.equations_at(states, values))
     inverse = ScaledEigen.of(found.equations.matrix).inverse()
-    shares = cost.shares(states)
+    shares = cost.state_equations(states)
     scatter = np.zeros_like(inverse)
     for share in shares:
         scatter += share.blocks.T @ share.blocks

@@ -43,7 +43,7 @@ _ALONG = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class StateEquations:
     """A state's share of the normal equations of the k unknowns, by the data's weights."""
 
     blocks: FloatArray
@@ -57,13 +57,13 @@ class Sums:
     """The same by noise alone."""
 
 
-class StateData(Protocol):
+class StateObservation(Protocol):
     """What is known of one state apart from force and strain."""
 
     def prepare(self, level: Level, state: ModelState) -> None:
         """Have the data of a level, weighted as the model's state asks for."""
 
-    def sums(self, state: ModelState) -> Sums:
+    def equations(self, state: ModelState) -> StateEquations:
         """The share of the normal equations at the model's state."""
 
 
@@ -97,20 +97,20 @@ class ImageData:
         images = self._images
         self._own = self.pixels.on(images.grid, images.mask, images.reference)
         self._weight, self._level = 1.0, level
-        sums = self._nodal(state)
-        if sums.pixels == 0:
+        nodal = self._nodal(state)
+        if nodal.pixels == 0:
             raise InputError("expected pixels of the model's mesh in both images, got none")
         if level != FULL:
             # Blurred pixels are alike: as many count as there are independent ones.
-            self._expected = sums.rms
-            self._weight = 1.0 / (sums.rms**2 * max(1.0, 4.0 * np.pi * level.blur**2))
+            self._expected = nodal.rms
+            self._weight = 1.0 / (nodal.rms**2 * max(1.0, 4.0 * np.pi * level.blur**2))
             return
         u, px = state.displacement, self.pair.grid.pixel_size
         gradients = element_gradients(mesh, u)
         det = np.maximum(determinant(np.eye(2) + gradients.mean(axis=1)), _LEAST_DET)
         transfer = NoiseTransfer.at(u[mesh.cells].mean(axis=1) / px, det, self.order)
         f, g = self.noise.reference**2, self.noise.deformed**2
-        slopes = float(sums.blocks[:, [0, 2]].sum()) / sums.pixels  # mean of |grad g|^2
+        slopes = float(nodal.blocks[:, [0, 2]].sum()) / nodal.pixels  # mean of |grad g|^2
         share = min(2.0 * g * transfer.slope / px**2 / slopes, _MOST_NOISE)
         self._expected = float(np.sqrt(f + g * transfer.value))
         self._weight = (1.0 - share) ** 2 / (f + g * transfer.density * (1.0 - share))
@@ -118,7 +118,7 @@ class ImageData:
     def _nodal(self, state: ModelState) -> NodalEquations:
         return normal_equations(self._own, self.pixels.mesh, self._images, state.displacement)
 
-    def sums(self, state: ModelState) -> Sums:
+    def equations(self, state: ModelState) -> StateEquations:
         """Projected from those of the nodes' displacements."""
         nodal, cells = self._nodal(state), self.pixels.mesh.cells
         S = state.displacement_by[:, cells]  # (k, m, 6, 2)
@@ -131,8 +131,10 @@ class ImageData:
         right = np.einsum("mba,kmb->kma", xy, x) + np.einsum("mab,kmb->kma", yy, y)
         matrix = np.einsum("jma,kma->jk", x, left) + np.einsum("jma,kma->jk", y, right)
         w = self._weight
-        return Sums(w * blocks, w * 0.5 * (matrix + matrix.T), w * nodal.square_sum, nodal.pixels,
-                    nodal.rms, self._expected)  # fmt: skip
+        return StateEquations(
+            w * blocks, w * 0.5 * (matrix + matrix.T), w * nodal.square_sum, nodal.pixels,
+            nodal.rms, self._expected,
+        )  # fmt: skip
 
     def residual(self, state: ModelState) -> FloatArray:
         """(rows, cols) f - g(x + u) [grey levels] of the pixels compared; NaN elsewhere."""
@@ -170,7 +172,7 @@ class FieldData:
     def prepare(self, level: Level, state: ModelState) -> None:
         """Nothing: displacements have no levels."""
 
-    def sums(self, state: ModelState) -> Sums:
+    def equations(self, state: ModelState) -> StateEquations:
         """By differences of displacements at the points."""
         left = self._u - np.einsum("pa,pai->pi", self._N, state.displacement[self._nodes])
         J = np.einsum("pa,kpai->kpi", self._N, state.displacement_by[:, self._nodes])
@@ -178,8 +180,10 @@ class FieldData:
         np.add.at(blocks, self._block, -np.einsum("kpi,pi->pk", J, self._w * left))
         matrix = np.einsum("jpi,kpi->jk", J, self._w * J)
         expected = float(np.sqrt(np.mean(1.0 / self._w)))
-        return Sums(blocks, matrix, float(np.sum(self._w * left**2)), left.size,
-                    float(np.sqrt(np.mean(left**2))), expected)  # fmt: skip
+        return StateEquations(
+            blocks, matrix, float(np.sum(self._w * left**2)), left.size,
+            float(np.sqrt(np.mean(left**2))), expected,
+        )  # fmt: skip
 
 
 MOTION = ("shift_x", "shift_y", "turn")
@@ -195,7 +199,7 @@ def rigidly_moved(
     number, count : of this state and of all: derivatives by the motions of all are put behind the
         model's own, and are zero for those of other states.
     """
-    u, by_turn, R = moved_displacement(state.displacement, nodes, motion)
+    u, by_turn, R = superposed_motion(state.displacement, nodes, motion)
     own = np.zeros((3 * count, *nodes.shape))
     own[3 * number : 3 * number + 3] = (*np.broadcast_to(np.eye(2)[:, None], (2, *nodes.shape)),
                                         by_turn)  # fmt: skip
@@ -206,7 +210,7 @@ def rigidly_moved(
     )  # fmt: skip
 
 
-def moved_displacement(
+def superposed_motion(
     u: FloatArray, nodes: FloatArray, motion: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(n, 2) displacement with the camera's motion in it, its derivative by the turn, and R."""

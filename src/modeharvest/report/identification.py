@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.identify import Identified
-from modeharvest.idic.finite_element.observed import ImageData, StateData
+from modeharvest.idic.finite_element.observed import ImageData, StateObservation
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
@@ -36,7 +36,7 @@ def identification_report(
     summary: Summary,
     found: Identified | None = None,
     mesh: Mesh | None = None,
-    data: Sequence[StateData | None] = (),
+    data: Sequence[StateObservation | None] = (),
 ) -> Report:
     """The report of an identification.
 
@@ -132,7 +132,7 @@ def _draw_force(states: Sequence[Mapping[str, Any]], reading_sd: float | None) -
 
 
 def _residual_cards(
-    found: Identified | None, mesh: Mesh | None, data: Sequence[StateData | None]
+    found: Identified | None, mesh: Mesh | None, data: Sequence[StateObservation | None]
 ) -> list[Card]:
     if found is None or mesh is None:
         return []

@@ -17,7 +17,7 @@ from pydantic import PrivateAttr, model_validator
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
-from modeharvest.idic.finite_element.identify import Scalar, Unknown
+from modeharvest.idic.finite_element.identify import Readings, Unknown
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
 from modeharvest.util.errors import InputError, require_within
@@ -76,13 +76,13 @@ class MeasuredData:
         require_within("data: expected strain_sd", self.strain_sd, 0.0, above=True)
 
     @property
-    def forces(self) -> Scalar | None:
+    def forces(self) -> Readings | None:
         """By thickness [N/mm]; None without any."""
         values = self.forces_N or self.forces_N_per_mm
         if not values or self.force_sd is None:
             return None
         thickness = self.thickness_mm if self.forces_N and self.thickness_mm else 1.0
-        return Scalar(np.array(values) / thickness, self.force_sd / thickness)
+        return Readings(np.array(values) / thickness, self.force_sd / thickness)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from modeharvest.idic.finite_element.identify import (
     LEVELS,
     FinerMesh,
     Identified,
-    Scalar,
+    Readings,
     Unknown,
     identify,
 )
@@ -32,10 +32,10 @@ from modeharvest.idic.finite_element.observed import (
     MOTION,
     FieldData,
     ImageData,
-    StateData,
-    moved_displacement,
+    StateObservation,
     nodal_values,
     rigidly_moved,
+    superposed_motion,
 )
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.local.field import read_field
@@ -157,7 +157,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         found = identify(
             states, data, unknowns | frame, pixel_size=px, forces=forces,
             levels=(*[Level(4, 3.0)] * (count > 0), *LEVELS),
-            strains=Scalar(np.array(experiment.strains), strain_sd),
+            strains=Readings(np.array(experiment.strains), strain_sd),
             finer=self._finer(list(unknowns), model.mesh), progress=self.progress,
         )  # fmt: skip
         solution = Solution(model.mesh, tuple(
@@ -189,12 +189,12 @@ class IdentificationRun(StagedRun[IdentificationCase]):
                 for state in model.at(own, False)
             ]
             for k, motion in enumerate(motions.reshape(-1, 3)):
-                found[k] = moved_displacement(found[k][0], mesh.nodes, motion)[0], found[k][1]
+                found[k] = superposed_motion(found[k][0], mesh.nodes, motion)[0], found[k][1]
             return found
 
         return FinerMesh(states, size / experiment.mesh_size)
 
-    def _data(self, mesh: Any) -> tuple[list[StateData | None], Scalar | None, float]:
+    def _data(self, mesh: Any) -> tuple[list[StateObservation | None], Readings | None, float]:
         """Of each state, with the forces, and the size of a pixel [mm]."""
         twin, data = self.case.twin, self.case.data
         if twin is not None:
@@ -208,7 +208,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
                 pair = ImagePair(f, g, images.grid)
                 states.append(ImageData(pair, pixels, ImageNoise(*sds)))
             readings = np.array(read_json(self.folder / "forces.json")["forces_N_per_mm"])
-            forces = Scalar(readings, twin.force_sd) if twin.force_sd > 0.0 else None
+            forces = Readings(readings, twin.force_sd) if twin.force_sd > 0.0 else None
             return [*states], forces, images.grid.pixel_size
         assert data is not None
         if data.fields:
@@ -243,12 +243,12 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         readings: FloatArray = (
             np.full(len(found.states), np.nan) if forces is None else forces.values
         )
-        of_states = zip(found.states, found.force_sd, readings, found.sums, strict=True)
+        of_states = zip(found.states, found.force_sd, readings, found.state_equations, strict=True)
         states = [
             {"nominal_strain": s.strain, "branch": s.branch, "negative_pivots": s.negative_pivots,
              "force_N_per_mm": s.force, "force_sd_N_per_mm": sd, "force_measured_N_per_mm": F,
-             "residual_rms": sums.residual, "residual_noise": sums.expected, "count": sums.count}
-            for s, sd, F, sums in of_states
+             "residual_rms": part.residual, "residual_noise": part.expected, "count": part.count}
+            for s, sd, F, part in of_states
         ]  # fmt: skip
         return dict[str, Any](to_plain({
             "title": case.title,
