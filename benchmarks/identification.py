@@ -24,8 +24,9 @@ from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.finite_element.identify import Readings, Unknown, identify
-from modeharvest.idic.finite_element.observed import FieldData, ImageData, nodal_values
+from modeharvest.idic.finite_element.observed import FieldData, ImageData
 from modeharvest.idic.finite_element.pixels import MeshPixels
+from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair

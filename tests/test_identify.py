@@ -22,14 +22,9 @@ from modeharvest.idic.finite_element.identify import (
     identify,
 )
 from modeharvest.idic.finite_element.mesh import quadratic
-from modeharvest.idic.finite_element.observed import (
-    MOTION,
-    FieldData,
-    ImageData,
-    nodal_values,
-    rigidly_moved,
-)
+from modeharvest.idic.finite_element.observed import MOTION, FieldData, ImageData, rigidly_moved
 from modeharvest.idic.finite_element.pixels import MeshPixels
+from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.imaging.grid import PixelGrid
@@ -184,7 +179,9 @@ def test_a_displacement_field_instead_of_images() -> None:
     found = identify(model, data, UNKNOWNS, pixel_size=0.04, forces=FORCES)
     assert np.all(np.abs(found.values - TRUE) < 4 * found.sd)
     assert np.all(found.sd[:2] / np.abs(TRUE[:2]) < 0.02)
-    np.testing.assert_allclose(nodal_values(MESH, MESH.nodes, points), points, atol=1e-9)
+    np.testing.assert_allclose(
+        nodal_values(MESH, MESH.nodes, points, beside=True), points, atol=1e-9
+    )
 
 
 def test_statements_name_what_the_data_do_not_determine() -> None:

@@ -33,7 +33,7 @@ from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.uncertainty.covariance import propagated_sd
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.isoparametric import interpolate, locate
+from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
@@ -161,9 +161,8 @@ class PatternState:
         low, high, step = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0), pitch / _PER_CELL
         cols, rows = (int(n) for n in (high - low) / step)
         grid = PixelGrid(rows, cols, step, low[0] + 0.5 * step, high[1] - 0.5 * step)
-        found = locate(mesh.nodes, mesh.cells, mesh.element, grid, "the solution's mesh")
-        target = np.moveaxis(interpolate(found, mesh.cells, mesh.element, u), 0, -1)
-        start = ansatz.initial_guess(strain, amplitude)
+        found = locate(mesh.nodes, mesh.cells, mesh.element, grid, "the solution's mesh", u)
+        target, start = np.moveaxis(found.values, 0, -1), ansatz.initial_guess(strain, amplitude)
         fit = fit_displacement(target, grid, ansatz, start, found.mask)
         return cls(fit.ansatz, fit.unknowns, fit.residual_rms)
 

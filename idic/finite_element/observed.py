@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.fields import determinant, element_gradients
@@ -20,12 +19,11 @@ from modeharvest.idic.finite_element.pixels import (
     images_on,
     normal_equations,
 )
-from modeharvest.idic.finite_element.result import local_coordinates
+from modeharvest.idic.finite_element.result import located
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, eroded
-from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.isoparametric import locate, locate_points
+from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.elements import shape_functions
@@ -159,7 +157,7 @@ class FieldData:
     def __init__(
         self, points: FloatArray, u: FloatArray, sd: FloatArray | float, mesh: Mesh
     ) -> None:
-        element, xi = _located(mesh, points)
+        element, xi = located(mesh, points)
         inside = (element >= 0) & np.isfinite(u).all(axis=1)
         if not inside.any():
             raise InputError("expected displacements at points of the specimen, got none there")
@@ -218,26 +216,6 @@ def superposed_motion(
     R, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
     at = nodes + u
     return at @ R.T + motion[:2] - nodes, at @ slope.T, R
-
-
-def _located(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
-    """(p,) elements and (p, 2) local coordinates of points (p, 2) [mm]; -1 beside the mesh."""
-    grid = PixelGrid.centred(3, 3, float(np.ptp(mesh.nodes[:, 0])) / 1000.0)
-    row, col = grid.to_px(points[:, 0], points[:, 1])
-    found = locate_points(mesh.nodes, mesh.cells, mesh.element, grid, row[None], col[None])
-    return found.element[0].astype(np.int64), found.xi[0].copy()
-
-
-def nodal_values(mesh: Mesh, nodal: FloatArray, points: FloatArray) -> FloatArray:
-    """(p, c) a mesh's nodal fields (n, c) at points (p, 2), just beside the mesh continued."""
-    element, xi = _located(mesh, points)
-    beside = np.flatnonzero(element < 0)
-    if beside.size:  # by edges of holes: parabolas through other points of the circle
-        middle = mesh.nodes[mesh.cells].mean(axis=1)
-        element[beside] = KDTree(middle).query(points[beside])[1]
-        xi[beside] = local_coordinates(mesh, element[beside], points[beside])
-    N = shape_functions(mesh.element, xi)
-    return np.asarray(np.einsum("pa,pac->pc", N, nodal[mesh.cells[element]]))
 
 
 def _blocks(mesh: Mesh) -> IntArray:

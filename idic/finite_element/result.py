@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
@@ -23,7 +24,7 @@ from modeharvest.idic.solver.assembly import Assembly
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.elements import shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -97,14 +98,7 @@ class NodalResult:
 
     def at(self, points: FloatArray, nodal: FloatArray | None = None) -> FloatArray:
         """(k, ...) nodal fields (n, ...), by default u [mm], at points (k, 2) [mm]; or NaN."""
-        points = np.asarray(points, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 2:
-            raise InputError(f"expected points of shape (k, 2), got {points.shape}")
-        mesh, nodal = self.mesh, self.displacement if nodal is None else nodal
-        row, col = self.grid.to_px(points[:, 0], points[:, 1])
-        found = locate_points(mesh.nodes, mesh.cells, mesh.element, self.grid, row[None], col[None])
-        values = interpolate(found, mesh.cells, mesh.element, nodal.reshape(len(nodal), -1))
-        return values[:, 0].T.reshape(len(points), *nodal.shape[1:])
+        return nodal_values(self.mesh, self.displacement if nodal is None else nodal, points)
 
     def displacement_on(self, grid: PixelGrid | None = None) -> FloatArray:
         """(rows, cols, 2) u at pixels [mm]."""
@@ -156,11 +150,9 @@ class NodalResult:
 
     def values_at(self, nodal: FloatArray, where: Where) -> FloatArray:
         """Values of nodal fields (n, ...) at the nodes, at pixels or at points."""
-        if where is None:
-            return nodal
-        return (
-            self.on_pixels(nodal, where) if isinstance(where, PixelGrid) else self.at(where, nodal)
-        )
+        if isinstance(where, PixelGrid):
+            return self.on_pixels(nodal, where)
+        return nodal if where is None else self.at(where, nodal)
 
     def deviation_at(self, nodal: FloatArray, where: Where) -> FloatArray:
         """The same of standard deviations, which stay positive."""
@@ -240,7 +232,7 @@ def _beside(mesh: Mesh, grid: PixelGrid, located: Located) -> tuple[NDArray[Any]
     distance, nearest = ndimage.distance_transform_edt(~located.mask, return_indices=True)
     rows, cols = np.nonzero((distance > 0.0) & (distance <= _BEYOND_PX))
     element = located.element[tuple(nearest[:, rows, cols])]
-    xi = local_coordinates(mesh, element, np.stack(grid.to_mm(rows, cols), axis=1))
+    xi = _local_coordinates(mesh, element, np.stack(grid.to_mm(rows, cols), axis=1))
     return rows, cols, mesh.cells[element], shape_functions(mesh.element, xi)
 
 
@@ -253,7 +245,29 @@ def _continue(beside: tuple[NDArray[Any], ...], nodal: FloatArray, values: Float
     values[:, rows, cols] = np.clip(found, own.min(axis=1) - reach, own.max(axis=1) + reach).T
 
 
-def local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
+def located(mesh: Mesh, points: FloatArray, beside: bool = False) -> tuple[IntArray, FloatArray]:
+    """(k,) elements, -1 or the nearest one beside the mesh, and (k, 2) local coordinates there."""
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise InputError(f"expected points of shape (k, 2), got {points.shape}")
+    x = mesh.nodes[mesh.cells]
+    size = np.sqrt(np.prod(np.ptp(mesh.nodes, axis=0)) / len(x))  # about that of an element
+    row, col = (grid := PixelGrid.centred(1, 1, size / 16.0)).to_px(*points[None].T)
+    found = locate_points(mesh.nodes, mesh.cells, mesh.element, grid, row, col)
+    element, xi = found.element[:, 0].astype(np.int64), found.xi[:, 0]
+    if (off := np.flatnonzero(element < 0)).size and beside:
+        element[off] = KDTree(x.mean(axis=1)).query(points[off])[1]
+        xi[off] = _local_coordinates(mesh, element[off], points[off])
+    return element, xi
+
+
+def nodal_values(mesh: Mesh, nodal: FloatArray, at: FloatArray, beside: bool = False) -> FloatArray:
+    """(k, ...) nodal fields (n, ...) at points (k, 2) [mm]; NaN beside the mesh, or continued."""
+    element, xi = located(mesh, at, beside)
+    N = shape_functions(mesh.element, xi)
+    return np.asarray(np.einsum("ka,ka...->k...", N, nodal[mesh.cells[element]]))
+
+
+def _local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
     """(k, 2) of points (k, 2) [mm] in elements (k,) that they are beside."""
     x = mesh.nodes[mesh.cells[element]]
     xi: FloatArray = np.full((element.size, 2), 1.0 / 3.0)

@@ -28,11 +28,12 @@ from numpy.typing import ArrayLike
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.field import LocalField, read_field
 from modeharvest.idic.local.tables import TEXTS, read_mat
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.imaging.mapping.isoparametric import interpolate, locate, locate_points
+from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util import __version__
 from modeharvest.util import files as disk
@@ -127,18 +128,8 @@ class BenchmarkTruth:
             raise InputError(
                 f"expected a strain of benchmark {self.id}, got {strain:g}; it has {have}"
             )
-        return displacement_at(self.solution, strain, self.grid, x, y)
-
-
-def displacement_at(
-    solution: Solution, strain: float, grid: PixelGrid, x: ArrayLike, y: ArrayLike
-) -> FloatArray:
-    """(n, 2) displacement of a snapshot at points (n,) of the reference [mm]; NaN beside it."""
-    mesh = solution.mesh
-    row, col = (position[None, :] for position in grid.to_px(x, y))
-    found = locate_points(mesh.nodes, mesh.cells, mesh.element, grid, row, col)
-    u = interpolate(found, mesh.cells, mesh.element, solution.at(strain).displacement)
-    return np.ascontiguousarray(u[:, 0].T)
+        u, points = self.solution.at(strain).displacement, np.column_stack([x, y])
+        return nodal_values(self.solution.mesh, u, points)
 
 
 def set_record(form: str, files: Mapping[str, Any], **content: Any) -> dict[str, Any]:

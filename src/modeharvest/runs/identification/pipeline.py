@@ -33,11 +33,11 @@ from modeharvest.idic.finite_element.observed import (
     FieldData,
     ImageData,
     StateObservation,
-    nodal_values,
     rigidly_moved,
     superposed_motion,
 )
 from modeharvest.idic.finite_element.pixels import MeshPixels
+from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
@@ -185,7 +185,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         def states(values: FloatArray) -> list[tuple[FloatArray, float]]:
             own, motions = np.split(values, [len(names)])
             found = [
-                (nodal_values(model.mesh, state.displacement, mesh.nodes), state.force)
+                (nodal_values(model.mesh, state.displacement, mesh.nodes, beside=True), state.force)
                 for state in model.at(own, False)
             ]
             for k, motion in enumerate(motions.reshape(-1, 3)):
