@@ -28,14 +28,7 @@ if TYPE_CHECKING:  # imported where it is needed: a child that meshes starts in 
 
 
 def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
-    """Move the mesh so that every hole has its own centre and diameter.
-
-    Hole edges stay ellipses of the same aspect; the motion fades out towards the cell's boundary,
-    so cells do not disturb each other and the outer edges stay straight. InputError if the scatter
-    could close the thinnest ligament: four standard deviations beyond half of it.
-    """
-    # Where y is scaled so that holes are circles.
-    scale, limit = np.array([1.0, specimen.aspect]), specimen.largest_diameter
+    """Move a mesh's holes at random; InputError if 4 standard deviations are half a ligament."""
     half = 0.5 * specimen.ligament_width
     reach = 4.0 * (imperfection.position_sd + 0.5 * imperfection.diameter_sd)
     if reach > half:
@@ -45,22 +38,24 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
         )
     if imperfection.is_none:
         return mesh
-    random = np.random.default_rng(imperfection.seed)
-    centres = specimen.hole_centres
-    shift = random.normal(0.0, 1.0, centres.shape) * imperfection.position_sd
-    growth = random.normal(0.0, 1.0, len(centres)) * 0.5 * imperfection.diameter_sd
+    holes = imperfection.drawn(len(specimen.hole_centres))
+    return replace(mesh, nodes=mesh.nodes + hole_motion(mesh.nodes, specimen, holes))
 
-    nodes = mesh.nodes.copy()
-    radii, outer = 0.5 * specimen.diameters, 0.5 * limit
-    for centre, radius, move, grow in zip(centres, radii, shift, growth, strict=True):
-        arm = (mesh.nodes - centre) / scale
-        distance = np.linalg.norm(arm, axis=1)
-        near = distance < outer
-        fade = np.clip((distance[near] - radius) / (outer - radius), 0.0, 1.0)
-        weight = np.cos(0.5 * np.pi * fade)[:, None] ** 2
-        outwards = scale * (arm[near] / distance[near][:, None])
-        nodes[near] += weight * (move + grow * outwards)
-    return replace(mesh, nodes=nodes)
+
+def hole_motion(nodes: FloatArray, specimen: Specimen, holes: FloatArray) -> FloatArray:
+    """(n, 2) motion of nodes (n, 2) for centres and diameters (holes, 3) off the specimen's [mm].
+
+    Hole edges stay ellipses of the same aspect; the motion fades out towards the cell's boundary,
+    so cells do not disturb each other and the outer edges stay straight. Linear in ``holes``.
+    """
+    number, scale = specimen.nearest_hole(nodes), np.array([1.0, specimen.aspect])
+    radius, outer = 0.5 * specimen.diameters[number], 0.5 * specimen.largest_diameter
+    arm = (nodes - specimen.hole_centres[number]) / scale
+    distance = np.linalg.norm(arm, axis=1)
+    fade = np.clip((distance - radius) / (outer - radius), 0.0, 1.0)
+    weight = np.where(distance < outer, np.cos(0.5 * np.pi * fade) ** 2, 0.0)
+    growth = (0.5 * holes[number, 2] / distance)[:, None] * scale * arm
+    return np.asarray(weight[:, None] * (holes[number, :2] + growth))
 
 
 # Reflecting a T6 element turns it inside out; this reorders its nodes counter-clockwise.

@@ -296,3 +296,9 @@ class Imperfection:
     def is_none(self) -> bool:
         """Whether there is no scatter at all: the specimen keeps its symmetries."""
         return self.position_sd == 0.0 and self.diameter_sd == 0.0
+
+    def drawn(self, count: int) -> FloatArray:
+        """(count, 3) by how much x and y of centres, and diameters, of holes are off [mm]."""
+        random = np.random.default_rng(self.seed)
+        shift = random.normal(0.0, 1.0, (count, 2)) * self.position_sd
+        return np.column_stack([shift, random.normal(0.0, 1.0, count) * self.diameter_sd])

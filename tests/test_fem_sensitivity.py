@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.simulate import simulate
-from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.finite_element.identify import Scalar, Unknown, identify
+from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.idic.finite_element.identify import Readings, Unknown, identify
 from modeharvest.idic.finite_element.observed import FieldData
 from modeharvest.util.errors import InputError
 
@@ -23,8 +24,14 @@ VALUES = np.array([1.2, 3.0, 5.4, 1.0, 0.0])
 BEFORE, AFTER = 0.06, 0.12
 
 
-def made(strains: tuple[float, ...], names: tuple[str, ...], **how: object) -> ParametricTest:
-    return ParametricTest(Experiment(SMALL, strains=strains, mesh_size=0.6, **how), names, MESH)  # type: ignore[arg-type]
+FINER = mesh_specimen(SMALL, 0.4)
+"""With coarser elements, a second mode is near, and it stays unstable up to 11 %."""
+
+
+def made(
+    strains: tuple[float, ...], names: tuple[str, ...], mesh: Mesh = MESH, **how: object
+) -> ParametricTest:
+    return ParametricTest(Experiment(SMALL, strains=strains, mesh_size=0.6, **how), names, mesh)  # type: ignore[arg-type]
 
 
 def require_derivatives(test: ParametricTest, values: np.ndarray) -> None:
@@ -90,6 +97,53 @@ def test_at_the_bifurcation_with_the_amplitude_as_an_unknown() -> None:
     assert state.strain_by[0] == pytest.approx((criticals[0] - criticals[1]) / 2e-4, rel=1e-3)
 
 
+def test_holes_and_edges_before_and_after_buckling() -> None:
+    """Derivatives of u at nodes that move; holes of their own, and edges that slide and spread."""
+    names = ("holes.diameter[0,0]", "holes[5].diameter", "holes.x[0,1]", "right.x[2]", "left.y[1]")
+    test = made((BEFORE, AFTER), names)
+    require_derivatives(test, np.array([0.03, 0.02, -0.015, 0.05, -0.04]))
+    state = test.at(np.array([0.03, 0.0, 0.0, 0.0, 0.0]), with_derivatives=False)[0]
+    at_hole = np.linalg.norm(MESH.nodes - SMALL.hole_centres[6], axis=1) < 0.801
+    radii = np.linalg.norm(state.mesh.nodes[at_hole] - SMALL.hole_centres[6], axis=1)
+    np.testing.assert_allclose(radii, 0.5 * (SMALL.diameter + 0.03), atol=1e-12)
+    assert np.abs(state.mesh.nodes - MESH.nodes).max() == pytest.approx(0.015, rel=1e-9)
+
+
+def test_holes_with_the_amplitude_as_an_unknown() -> None:
+    test = made((0.1,), ("holes.diameter[0,0]", "holes[3].x", "amplitude[0]"), FINER)
+    require_derivatives(test, np.array([0.02, 0.01, 0.13]))
+
+
+def test_scattered_holes_are_those_of_the_simulation() -> None:
+    """Its natural path leads to one of the branches; that of the name is continued to the same."""
+    imperfection = Imperfection(0.006, 0.006, seed=2)
+    natural = simulate(
+        Experiment(SMALL, strains=(BEFORE, AFTER), mesh_size=0.4, imperfection=imperfection)
+    )
+    names = [f"holes[{k}].{part}" for k in range(16) for part in ("x", "y", "diameter")]
+    holes = imperfection.drawn(16)
+    test = made((BEFORE, AFTER), tuple(names), FINER)
+    assert test.amplitude(natural.at(AFTER).displacement) > 0.1
+    for state in test.at(holes.ravel(), with_derivatives=False):
+        snapshot = natural.at(state.strain)
+        np.testing.assert_allclose(state.mesh.nodes, natural.mesh.nodes, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(state.displacement, snapshot.displacement, rtol=0, atol=1e-6)
+        assert state.force == pytest.approx(snapshot.reaction, rel=1e-6)
+
+
+def test_motion_of_the_edges() -> None:
+    """Legendre polynomials of the place along an edge, times the nominal strain."""
+    names = ("right.x[2]", "right.y[0]", "left.x[1]", "tilt")
+    (state,) = made((BEFORE,), names).at(np.array([0.2, -0.3, 0.1, 0.04]), with_derivatives=False)
+    (x, y), (a, b), u = MESH.nodes.T, SMALL.half_size, state.displacement
+    right, left = x > a - 1e-9, x < 1e-9 - a
+    stroke, s = 0.5 * SMALL.length, y / b
+    of_right = -stroke + 0.2 * (1.5 * s**2 - 0.5) - 0.04 * y
+    np.testing.assert_allclose(u[right, 0], BEFORE * of_right[right], atol=1e-13)
+    np.testing.assert_allclose(u[right, 1], -0.3 * BEFORE, atol=1e-13)
+    np.testing.assert_allclose(u[left, 0], BEFORE * (stroke + 0.1 * s)[left], atol=1e-13)
+
+
 def test_moduli_and_another_material() -> None:
     require_derivatives(made((BEFORE,), ("moduli[0]",)), np.array([1.2]))
     test = made((BEFORE,), ("c1", "c2", "bulk"), material=TwoTermI1())
@@ -114,7 +168,7 @@ def test_parameters_are_identified_from_a_state_beside_the_bifurcation() -> None
         "kappa": Unknown(4.4, (0.5, 100.0)),
         "amplitude[1]": Unknown(0.05, (1e-4, 1.0)),
     }
-    readings = Scalar(np.array(strains), 1e-5)
+    readings = Readings(np.array(strains), 1e-5)
     found = identify(test.at, data, unknowns, pixel_size=0.03, strains=readings)
     exact = np.array([3.0, 5.4, test.amplitude(true[1].displacement)])
     assert np.all(np.abs(found.values - exact) < 4.0 * found.sd)
@@ -125,6 +179,18 @@ def test_parameters_are_identified_from_a_state_beside_the_bifurcation() -> None
 def test_what_it_is_not_made_for() -> None:
     with pytest.raises(InputError, match=r"expected some of .*'kappa'.*'tilt'.*got 'mu'"):
         made((BEFORE,), ("mu",))
+    for name, message in (
+        ("holes[16].x", r"expected a hole from 0 to 15 in holes\[16\].x, got 16"),
+        ("holes.x[7,0]", "expected a degree from 0 to 6"),
+        ("holes.z[0,0]", "expected some of .*'holes.diameter.i,j.'.*got 'holes.z"),
+        ("amplitude[1]", "expected a state from 0 to 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            made((BEFORE,), (name,))
+    with pytest.raises(InputError, match=r"expected clamped edges for right.y.0., got 'sliding'"):
+        made((BEFORE,), ("right.y[0]",), edges="sliding")
+    with pytest.raises(InputError, match=r"at most 60 % of half a ligament, got 0.15 mm of hole 0"):
+        made((BEFORE,), ("holes.diameter[0,0]",)).at(np.array([0.3]))
     with pytest.raises(InputError, match=r"15 % on the buckled\+ path, got none"):
         made((0.15,), ("amplitude[0]",)).at(np.array([5.0]))
     odd = Experiment(Specimen(4, 2), strains=(0.16,), mesh_size=0.55)

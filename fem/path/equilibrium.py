@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import dolfinx
@@ -20,7 +21,7 @@ from modeharvest.fem.field import Mesh
 from modeharvest.fem.hyperelastic import Hyperelastic
 from modeharvest.fem.materials import Material
 from modeharvest.fem.path.factor import BodyFactor, factorise
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
 
@@ -49,7 +50,8 @@ class Structure:
 
     Vectors are PETSc vectors over all displacement components; ``u`` includes the constrained ones.
     ``factorisations`` counts every numerical factorisation. The mesh (T6) is needed on rank 0 only.
-    ``constants`` are the material's that can be changed: all of them if ``parametric``.
+    ``constants`` are the material's that can be changed: all of them if ``parametric``. ``nodes``
+    are where the mesh's nodes are now, see :meth:`place` [mm].
     """
 
     def __init__(
@@ -60,7 +62,7 @@ class Structure:
         comm: MPI.Comm = MPI.COMM_WORLD,
         parametric: bool = False,
     ) -> None:
-        self.mesh, self.comm = mesh, comm
+        self.mesh, self.comm, self.nodes = mesh, comm, mesh.nodes
         self._forms = Hyperelastic(mesh, material, comm, parametric)
         self.constants = self._forms.constants
         self.V, self._u = self._forms.V, self._forms.u
@@ -89,9 +91,7 @@ class Structure:
         target = self._direction.x.array.reshape(-1, 2)
         target[along, 0] = -0.5 * loading.length * np.sign(x[along, 0])
         self._shortening, turning = self._direction.x.array.copy(), along[x[along, 0] > 0.0]
-        self._turning = np.zeros_like(self._shortening)
-        self._turning[2 * turning] = x[turning, 1]
-        self.turn(loading.tilt)
+        self._direction.x.array[2 * turning] -= loading.tilt * x[turning, 1]
         dofs = 2 * along, 2 * across + 1
         # Only the matrices use these, and there the value is of no account.
         self._bcs = [
@@ -101,16 +101,35 @@ class Structure:
         fixed = np.union1d(*dofs)
         self._fixed_owned = fixed[fixed < 2 * self.V.dofmap.index_map.size_local]
 
-    def turn(self, tilt: float) -> None:
-        """Have the edge x = +half_width turn by another tilt, see :class:`EdgeCompression`."""
-        self._direction.x.array[:] = self._shortening - tilt * self._turning
-        self._direction.x.scatter_forward()
+    def place(self, nodes: FloatArray) -> None:
+        """Put the mesh's nodes at ``nodes`` (n, 2) [mm]; on one rank."""
+        geometry = self.V.mesh.geometry
+        geometry.x[:, :2] = nodes[geometry.input_global_indices]
+        self.nodes = nodes
 
-    def turning(self, strain: float) -> PETSc.Vec:
-        """d(constrained displacements)/d(tilt) at a nominal strain [mm/rad], zero elsewhere."""
+    def lead(self, edges: FloatArray) -> None:
+        """Have constrained components move by strain * ``edges`` (n, 2) beyond the shortening.
+
+        Those of nodal values [mm], others are of no account; on one rank.
+        """
+        direction = self._direction.x
+        direction.array[:] = self._shortening
+        direction.petsc_vec.axpy(1.0, self.constrained(edges))
+
+    def constrained(self, field: FloatArray) -> PETSc.Vec:
+        """Vector with the constrained components of nodal values (n, 2) only; on one rank."""
         vector, fixed = self.zero(), self._fixed_owned
-        vector.array[fixed] = -strain * self._turning[fixed]
+        values = np.empty_like(vector.array)
+        values[self._order] = field.ravel()
+        vector.array[fixed] = values[fixed]
         return vector
+
+    @cached_property
+    def _order(self) -> IntArray:
+        """Position in dolfinx's order of every component in the order of the nodes."""
+        count = len(self.mesh.nodes)
+        numbers = dolfinx_api.gather_nodes(self.V, np.arange(2 * count, dtype=np.float64), count)
+        return np.rint(numbers).astype(np.int64).ravel()
 
     def zero(self) -> PETSc.Vec:
         """The undeformed state."""

@@ -2,14 +2,15 @@
 
 Forms are compiled once, with the parameters as constants. The states of each set of parameters are
 found along the whole path, from the undeformed specimen through its critical point to the branch
-that is asked for, so they do not depend on what was tried before. A tilt comes last: at each state
-of the specimen without it, turned while the strain is kept, which stays on the branch of that name
-where the natural path would lead to whichever branch the tilt favours.
+that is asked for, so they do not depend on what was tried before. What breaks the specimen's mirror
+symmetry comes last (a tilt, holes of their own): at each state of the specimen without it, brought
+in while the strain is kept, which stays on the branch of that name where the natural path would
+lead to whichever branch it favours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,14 +20,15 @@ from petsc4py import PETSc
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.meshing import hole_motion
 from modeharvest.fem.path.bifurcation import Critical, follow_branch, locate_critical
 from modeharvest.fem.path.continuation import BranchPoint, PathFollower, State, load_at, value_at
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.newton import Constraint
+from modeharvest.fem.path.parameters import TILT, TRAVEL, holes_of, parameter, require_open
 from modeharvest.fem.path.sensitivity import (
-    TILT,
-    TRAVEL,
     Sensitivity,
+    Variation,
     amplitude_sensitivity,
     sensitivities,
 )
@@ -34,7 +36,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _SIGNS = {"buckled+": 1, "buckled-": -1}
-_SHORTEST = 1 / 64  # of a tilt or of an amplitude, in one step
+_SHORTEST = 1 / 64  # of what breaks the symmetry, or of an amplitude, in one step
 _NO_PATTERN = 1e-6  # overlap of a mode with the pattern
 _BEYOND = 2.0  # times the last strain: where to look for a critical point at most
 _ATTEMPTS = 3  # with shorter and shorter steps
@@ -46,6 +48,8 @@ class ParametricState:
 
     strain: float
     """Nominal [-]: that of the test times the travel, or what the amplitude makes it."""
+    mesh: Mesh
+    """The undeformed one, with its holes where the parameters put them."""
     displacement: FloatArray
     """(n, 2) of the mesh's nodes [mm]."""
     force: float
@@ -53,7 +57,8 @@ class ParametricState:
     negative_pivots: int
     branch: str
     displacement_by: FloatArray
-    """(k, n, 2) [mm per unit of the parameter]."""
+    nodes_by: FloatArray
+    """(k, n, 2) of the nodes' displacements, and where nodes go themselves [mm per unit]."""
     force_by: FloatArray
     """(k,) [N/mm per unit]."""
     strain_by: FloatArray
@@ -64,9 +69,9 @@ class ParametricTest:
     """The states of a virtual test at its strains, for any values of its unknown parameters.
 
     experiment : with the values of everything that isn't unknown; of its branches the first counts.
-    names : of the unknowns: "kappa", "moduli[0]" and so on as the material calls its constants,
-        "travel", "tilt" (see ``sensitivity``), and "amplitude[k]" for the state number k, which is
-        then found by the pattern's amplitude [mm] instead of its nominal strain.
+    names : of the unknowns, see :func:`modeharvest.fem.path.parameters.parameter`. With
+        "amplitude[k]" the state number k is found by the pattern's amplitude [mm] instead of its
+        nominal strain.
     mesh : T6, of the specimen.
     """
 
@@ -76,12 +81,9 @@ class ParametricTest:
         loading = EdgeCompression(spec.half_size[0], spec.length, experiment.edges, 0.0, pins)
         comm = MPI.COMM_SELF
         self.structure = Structure(mesh, experiment.material, loading, comm, parametric=True)
-        states = [f"amplitude[{k}]" for k in range(len(experiment.strains))]
-        known = [*self.structure.constants, TRAVEL, TILT, *states]
-        for name in names:
-            if name not in known:
-                raise InputError(f"unknowns: expected some of {known}, got {name!r}")
         self.experiment, self.names, self.mesh = experiment, tuple(names), mesh
+        self._parameters = {name: parameter(name, experiment) for name in (*names, TILT)}
+        self._variations = {name: self._variation(name) for name in self._parameters}
         self._follower = PathFollower(self.structure, experiment.path)
         pattern = self.structure.from_function(spec.pattern)
         weighted = self._follower.mass * pattern
@@ -108,15 +110,48 @@ class ParametricTest:
         given = dict(zip(self.names, map(float, values), strict=True))
         for name, constant in self.structure.constants.items():
             constant.value = given.get(name, float(constant.value))
-        travel, tilt = given.get(TRAVEL, 1.0), given.get(TILT, self.experiment.tilt)
+        travel = given.get(TRAVEL, 1.0)
         amplitudes = {k: given.get(f"amplitude[{k}]") for k in range(len(self.experiment.strains))}
+        given = {TILT: self.experiment.tilt, **given}
+        off = holes_of(list(given), list(given.values()), self.experiment)
+        require_open(self.experiment.specimen, off)
+        keeping = {name for name in given if self._parameters[name].is_symmetric}
+        first, late = self._sum(given, keeping), self._sum(given, given.keys() - keeping)
+        mesh = self.mesh
+        if off.any():
+            mesh = replace(mesh, nodes=mesh.nodes + first.nodes + late.nodes)
+        self._vary(first)
         found = []
         for k, (state, branch) in enumerate(self._states(travel, amplitudes)):
-            self.structure.turn(0.0)
             weights = None if amplitudes[k] is None else self._weights
-            turned = self._turned(state, tilt, weights) if tilt != 0.0 else state
-            found.append(self._result(turned, branch, k, travel, weights, with_derivatives))
+            if late.nodes.any() or late.edges.any():
+                state = self._bent(state, first, late, weights)
+            found.append(self._result(state, mesh, branch, k, travel, weights, with_derivatives))
         return found
+
+    def _variation(self, name: str) -> Variation:
+        """How the structure changes with a parameter."""
+        found, spec, nodes = self._parameters[name], self.experiment.specimen, self.mesh.nodes
+        zero = np.zeros_like(nodes)
+        return Variation(
+            zero if found.holes is None else hole_motion(nodes, spec, found.holes),
+            zero if found.edge is None else found.edge.at(nodes, spec),
+            found.constant,
+        )
+
+    def _sum(self, values: Mapping[str, float], names: Iterable[str]) -> Variation:
+        """What some of the parameters make of nodes and edges together."""
+        nodes, edges = np.zeros_like(self.mesh.nodes), np.zeros_like(self.mesh.nodes)
+        for name in names:
+            nodes += values[name] * self._variations[name].nodes
+            edges += values[name] * self._variations[name].edges
+        return Variation(nodes, edges)
+
+    def _vary(self, first: Variation, share: float = 0.0, late: Variation | None = None) -> None:
+        """Have the structure with one variation and a share of another."""
+        late = late or first
+        self.structure.place(self.mesh.nodes + first.nodes + share * late.nodes)
+        self.structure.lead(first.edges + share * late.edges)
 
     # -- the path -----------------------------------------------------------------------
 
@@ -158,7 +193,6 @@ class ParametricTest:
     ) -> tuple[list[State], Critical | None]:
         """The primary path through the strains until it becomes unstable, and where that is."""
         follower, options = self._follower, self.experiment.path
-        self.structure.turn(0.0)
         follower.options, follower.linearisation, follower.modes = options, None, []
         path, targets = [follower.start()], sorted({*strains, largest})
         if not self.experiment.imperfection.is_none:
@@ -225,29 +259,33 @@ class ParametricTest:
             step *= 2.0
         return state
 
-    def _turned(self, state: State, tilt: float, weights: PETSc.Vec | None) -> State:
-        """The state of the same strain or amplitude with the edge at x > 0 tilted, in steps."""
+    def _bent(
+        self, state: State, first: Variation, late: Variation, weights: PETSc.Vec | None
+    ) -> State:
+        """The state of the same strain or amplitude with what breaks the symmetry, in steps."""
         structure, follower = self.structure, self._follower
-        length, constraint, reached, step = self.experiment.specimen.length, None, 0.0, tilt
+        length, constraint, reached, step = self.experiment.specimen.length, None, 0.0, 1.0
         if weights is not None:
             constraint = Constraint(weights, structure.zero(), float(weights.dot(state.u)))
-        while reached != tilt:
-            aim = tilt if abs(tilt - reached) <= 1.01 * abs(step) else reached + step
-            structure.turn(reached)
-            (rate,) = sensitivities(structure, state, [TILT], length, weights)
+        while reached < 1.0:
+            aim = 1.0 if 1.0 - reached <= 1.01 * step else reached + step
+            self._vary(first, reached, late)
+            (rate,) = sensitivities(structure, state, [late], length, weights)
             guess = state.u + (aim - reached) * rate.displacement
             strain = state.strain + (aim - reached) * rate.strain
-            structure.turn(aim)
+            self._vary(first, aim, late)
             follower.linearisation = None
             found = follower.equilibrium(strain, guess, constraint, with_modes=False)
             # A small amplitude that the tilt works against is that of an unstable state.
             is_slip = constraint is None and found and found.negative_pivots > state.negative_pivots
             if found is None or is_slip:
                 step *= 0.5
-                if abs(step) < _SHORTEST * abs(tilt):
+                if step < _SHORTEST:
                     raise InputError(
                         f"expected an equilibrium at a nominal strain of {100 * state.strain:.4g} "
-                        f"% under a tilt of {tilt:.4g} rad, got none on this branch"
+                        "% with a tilt or holes of their own, got none beyond "
+                        f"{100 * reached:.3g} % of them: give them less, or a state farther from "
+                        "buckling, or its amplitude as an unknown"
                     )
                 continue
             state, reached = found, aim
@@ -256,24 +294,27 @@ class ParametricTest:
     # -- its states ---------------------------------------------------------------------
 
     def _result(
-        self, state: State, branch: str, number: int, travel: float, weights: PETSc.Vec | None,
-        with_derivatives: bool,
+        self, state: State, mesh: Mesh, branch: str, number: int, travel: float,
+        weights: PETSc.Vec | None, with_derivatives: bool,
     ) -> ParametricState:  # fmt: skip
         structure, length = self.structure, self.experiment.specimen.length
         by: list[Sensitivity | None] = []
-        if with_derivatives:
-            own = [n for n in self.names if not n.startswith("amplitude")]
-            parts = sensitivities(structure, state, own, length, weights, travel)
+        names = self.names if with_derivatives else ()
+        if names:
+            own = [n for n in names if not n.startswith("amplitude")]
+            variations = [None if n == TRAVEL else self._variations[n] for n in own]
+            parts = sensitivities(structure, state, variations, length, weights, travel)
             known: dict[str, Any] = dict(zip(own, parts, strict=True))
             if weights is not None:
                 derivative = amplitude_sensitivity(structure, state, length, weights)
                 known[f"amplitude[{number}]"] = derivative
-            by = [known.get(name) for name in self.names]
+            by = [known.get(name) for name in names]
         zero = np.zeros_like(self.mesh.nodes)
         fields = [zero if s is None else structure.nodal(s.displacement) for s in by]
         return ParametricState(
-            state.strain, structure.nodal(state.u), structure.reaction(state.u, length),
+            state.strain, mesh, structure.nodal(state.u), structure.reaction(state.u, length),
             state.negative_pivots, branch, np.array(fields).reshape(len(by), *zero.shape),
+            np.array([self._variations[n].nodes for n in names]).reshape(len(by), *zero.shape),
             np.array([0.0 if s is None else s.force for s in by]),
             np.array([0.0 if s is None else s.strain for s in by]),
         )  # fmt: skip

@@ -1,0 +1,153 @@
+"""Parameters of a compression test by their names: what each changes in the model, and its unit.
+
+Constants of the material stand in its energy. Everything else is linear in its parameters: where
+holes are, of which a smooth map moves a mesh's nodes, and how loaded edges move. Polynomials are
+products of Legendre's: P_i(x/a) P_j(y/b) over the cellular part, P_j(y/b) along an edge.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import Legendre
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.specimen import Specimen
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+TRAVEL, TILT = "travel", "tilt"
+"""Unknowns of the loaded edges: a factor of all nominal strains [-], and the tilt of the edge at
+x > 0 per nominal strain [rad]."""
+_PARTS = ("x", "y", "diameter")
+_PART, _DEGREE = "(x|y|diameter)", r"(\d+)"
+_OWN = re.compile(rf"holes\[(\d+)\]\.{_PART}")
+_SMOOTH = re.compile(rf"holes\.{_PART}\[{_DEGREE}, ?{_DEGREE}\]")
+_EDGE = re.compile(rf"(left|right)\.(x|y)\[{_DEGREE}\]")
+_AMPLITUDE = re.compile(r"amplitude\[(\d+)\]")
+_HIGHEST = 6  # degree of a polynomial
+_OPEN = 0.6
+"""Share of half a ligament that a hole's edge may move: with more the map of the mesh folds."""
+
+
+@dataclass(frozen=True)
+class EdgeMotion:
+    """How a loaded edge moves by a unit of a parameter and of nominal strain: a polynomial."""
+
+    side: int
+    """-1 for the edge at x < 0, 1 for that at x > 0."""
+    axis: int
+    degree: int
+    factor: float = 1.0
+
+    def at(self, nodes: FloatArray, spec: Specimen) -> FloatArray:
+        """(n, 2) displacement of nodes (n, 2) per nominal strain [mm per unit]; 0 off the edge."""
+        half, found = spec.half_size, np.zeros_like(nodes)
+        there = np.abs(nodes[:, 0] - self.side * half[0]) < 1e-8 * half[0]
+        profile = Legendre.basis(self.degree)(nodes[there, 1] / half[1])
+        found[there, self.axis] = self.factor * profile
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """What a parameter of a test changes, per unit of it."""
+
+    unit: str
+    constant: str = ""
+    """Of the material, by its name."""
+    holes: FloatArray | None = None
+    """(holes, 3) x and y of the centres, and diameters [mm per unit]."""
+    edge: EdgeMotion | None = None
+    is_symmetric: bool = True
+    """Whether holes stay mirror images of each other about both axes; of edges, about the x axis,
+    under which the pattern of an even number of rows changes its sign: the test still buckles at a
+    bifurcation, whose strain answers."""
+
+
+def parameter(name: str, experiment: Experiment) -> Parameter:
+    """What a name stands for.
+
+    "kappa", "moduli[0]" and so on, as the material calls its constants; TRAVEL, TILT;
+    "amplitude[k]", of the pattern in the state number k; "holes.x[i,j]", "holes.y[i,j]" and
+    "holes.diameter[i,j]" of all holes by a polynomial, "holes[k].x" and so on of the hole number k
+    alone, in the order of ``Specimen.hole_centres``; "right.x[j]", "left.y[j]" and so on of the
+    loaded edges. InputError if the test has no such parameter.
+    """
+    spec = experiment.specimen
+    if name in (known := list(_constants(experiment))):
+        return Parameter("-" if name.startswith("exponents") else "MPa", constant=name)
+    if name == TRAVEL:
+        return Parameter("-")
+    if name == TILT:
+        return Parameter("rad", edge=EdgeMotion(1, 0, 1, -spec.half_size[1]), is_symmetric=False)
+    if found := _AMPLITUDE.fullmatch(name):
+        _require(name, "a state", int(found[1]), len(experiment.strains))
+        return Parameter("mm")
+    if found := _OWN.fullmatch(name):
+        number, holes = int(found[1]), np.zeros((len(spec.hole_centres), 3))
+        _require(name, "a hole", number, len(holes))
+        holes[number, _PARTS.index(found[2])] = 1.0
+        return Parameter("mm", holes=holes, is_symmetric=False)
+    if found := _SMOOTH.fullmatch(name):
+        degrees, part = (int(found[2]), int(found[3])), _PARTS.index(found[1])
+        _require(name, "a degree", max(degrees), _HIGHEST + 1)
+        where = (spec.hole_centres / spec.cellular_half_size).T
+        along, across = (Legendre.basis(d)(s) for d, s in zip(degrees, where, strict=True))
+        holes = np.zeros((len(along), 3))
+        holes[:, part] = along * across
+        odd = tuple(degree % 2 == 1 for degree in degrees)
+        return Parameter("mm", holes=holes, is_symmetric=odd == (part == 0, part == 1))
+    if found := _EDGE.fullmatch(name):
+        axis, degree = "xy".index(found[2]), int(found[3])
+        _require(name, "a degree", degree, _HIGHEST + 1)
+        if axis == 1 and experiment.edges != "clamped":
+            raise InputError(
+                f"unknowns: expected clamped edges for {name}, got {experiment.edges!r} ones, "
+                "along which nothing is prescribed"
+            )
+        motion = EdgeMotion(-1 if found[1] == "left" else 1, axis, degree)
+        is_symmetric = spec.holes_y % 2 == 0 and degree % 2 == axis
+        return Parameter("mm", edge=motion, is_symmetric=is_symmetric)
+    known += [TRAVEL, TILT, "amplitude[k]", "holes.x[i,j]", "holes.y[i,j]", "holes.diameter[i,j]"]
+    known += ["holes[k].x", "holes[k].y", "holes[k].diameter", "right.x[j]", "right.y[j]"]
+    known += ["left.x[j]", "left.y[j]"]
+    raise InputError(f"unknowns: expected some of {known}, got {name!r}")
+
+
+def _constants(experiment: Experiment) -> Iterator[str]:
+    for name, value in vars(experiment.material).items():
+        parts = range(len(value)) if isinstance(value, tuple) else ()
+        yield from (f"{name}[{k}]" for k in parts) if parts else [name]
+
+
+def _require(name: str, what: str, number: int, count: int) -> None:
+    if number >= count:
+        raise InputError(f"unknowns: expected {what} from 0 to {count - 1} in {name}, got {number}")
+
+
+def holes_of(
+    names: Sequence[str], values: Sequence[float] | FloatArray, experiment: Experiment
+) -> FloatArray:
+    """(holes, 3) by how much centres and diameters are off the specimen's, by parameters [mm]."""
+    parts = [parameter(name, experiment).holes for name in names]
+    total = np.zeros((len(experiment.specimen.hole_centres), 3))
+    for value, part in zip(values, parts, strict=True):
+        total = total if part is None else total + value * part
+    return total
+
+
+def require_open(specimen: Specimen, holes: FloatArray) -> None:
+    """InputError if holes are off by so much that they come near their neighbours'."""
+    moved = np.linalg.norm(holes[:, :2], axis=1) + 0.5 * np.abs(holes[:, 2])
+    share = moved / (0.5 * (specimen.largest_diameter - specimen.diameters))
+    if share.max() > _OPEN:
+        k = int(np.argmax(share))
+        raise InputError(
+            f"expected edges of holes that move by at most {100 * _OPEN:.0f} % of half a ligament, "
+            f"got {moved[k]:.3g} mm of hole {k}; make the bounds of the holes' unknowns narrower, "
+            "or the specimen's diameter more like the real one's"
+        )
