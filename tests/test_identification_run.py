@@ -58,6 +58,8 @@ def test_a_twin_is_identified_from_its_own_images(run: tuple[Path, dict[str, Any
     for state in summary["states"]:
         assert state["residual_rms"] == pytest.approx(state["residual_noise"], rel=0.05)
     assert np.allclose(np.diag(summary["correlations"]), 1.0)
+    assert summary["model_error"]["p_value"] > 1e-3
+    assert summary["statements"][0].startswith("no model error shows in the residuals (chi sq")
     assert json.loads((folder / "summary.json").read_text("utf-8")) == summary
     page = (folder / "report.html").read_text("utf-8")
     assert 'id="residual-2"' in page

@@ -27,6 +27,7 @@ from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, Level
+from modeharvest.idic.uncertainty.model_error import corrections
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
@@ -210,6 +211,63 @@ def test_a_wrong_model_widens_the_intervals() -> None:
     wrong = identify(sheared, images(0), UNKNOWNS, pixel_size=0.04, forces=FORCES)
     assert np.all(right.sd_with_model_error < 2.0 * right.sd)
     assert np.all(wrong.sd_with_model_error[:2] > 2.0 * wrong.sd[:2])
+
+
+CORRECTIONS = corrections(MESH.nodes, np.eye(2) * 1.5, degree=1)
+
+
+def test_a_right_model_is_seldom_rejected() -> None:
+    """12 seeds of 158 corrections: the mean of chi squared, and no p-value below 0.1 %."""
+    tests = []
+    for seed in range(12):
+        test = found_from(seed, levels=(FULL,), corrections=CORRECTIONS).model_error
+        assert test is not None
+        tests.append(test)
+    counts = {test.degrees_of_freedom for test in tests}
+    assert max(counts) <= 2 * len(CORRECTIONS) + 2  # of each state, and of its force
+    ratio = np.mean([t.chi_squared / t.degrees_of_freedom for t in tests])
+    assert ratio == pytest.approx(1.0, abs=3.5 * np.sqrt(2.0 * 1.25 / min(counts) / 12))
+    assert min(t.p_value for t in tests) > 1e-3
+    assert "no model error shows" in str(tests[0])
+
+
+def test_a_wrong_model_is_rejected() -> None:
+    """It can't shear, or its force is a third off and has a law of its own; noise hides neither."""
+    shear = 2e-3 * np.sin(2 * MESH.nodes[:, ::-1])
+
+    def sheared(values: FloatArray) -> list[State]:
+        return [replace(s, displacement=s.displacement + shear) for s in model(values)]
+
+    given = {"pixel_size": 0.04, "corrections": CORRECTIONS}
+    wrong = identify(sheared, images(0), UNKNOWNS, forces=FORCES, **given)  # type: ignore[arg-type]
+    test = wrong.model_error
+    assert test is not None
+    assert test.p_value < 1e-9
+    size = np.sqrt(2.0 * (shear**2).sum(axis=1).mean())  # of both states together
+    assert 0.7 * size < test.rms < 1.2 * size
+    assert wrong.statements[0].startswith("the model is wrong (chi squared")
+    forces = Readings(FORCES.values * [1.0, 1.3], FORCES.sd)
+    found = identify(model, images(0), UNKNOWNS, forces=forces, **given)  # type: ignore[arg-type]
+    assert found.model_error is not None
+    assert found.model_error.is_rejected
+
+
+def test_what_a_mesh_is_wrong_by_does_not_make_a_law_wrong() -> None:
+    """Its error is that of the test before, and on a finer mesh a quarter of it."""
+    shear = 2e-3 * np.sin(2 * MESH.nodes[:, ::-1])
+
+    def by_mesh(values: FloatArray) -> list[State]:
+        return [replace(s, displacement=s.displacement + shear) for s in model(values)]
+
+    def finer(values: FloatArray) -> list[tuple[FloatArray, float]]:
+        return [(s.displacement + 0.25 * shear, s.force) for s in model(values)]
+
+    given = {"pixel_size": 0.04, "corrections": CORRECTIONS, "forces": FORCES}
+    found = identify(
+        by_mesh, images(0), UNKNOWNS, finer=FinerMesh(finer, 0.5), **given  # type: ignore[arg-type]
+    )  # fmt: skip
+    assert found.model_error is not None
+    assert not found.model_error.is_rejected
 
 
 def test_a_finer_mesh_has_the_last_word() -> None:

@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from modeharvest.idic.finite_element.observed import ImageData, StateEquations, StateObservation
+from modeharvest.idic.finite_element.score import Scalar, joint_score
 from modeharvest.idic.solver.assembly import NormalEquations
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, minimise
 from modeharvest.idic.solver.pyramid import FULL, Level
+from modeharvest.idic.uncertainty.model_error import ScoreTest, score_test
 from modeharvest.idic.uncertainty.parameters import undetermined_combinations
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -95,7 +97,7 @@ class Identified:
     values: FloatArray
     """(k,) in the order of the unknowns."""
     covariance: FloatArray
-    """(k, k) by noise: the inverse of the normal matrix of all data."""
+    """(k, k) by noise, that of a reference which several states share included."""
     covariance_with_model_error: FloatArray
     """(k, k) by what the residual is, from part to part of the body, in place of its noise; that of
     forces and strains at least their noise."""
@@ -109,6 +111,8 @@ class Identified:
     """(k,) taken for what the finer mesh leaves, and added to the values: from how far it moved
     them, as errors go with the square of the elements' size; 0 where there was no finer mesh."""
     forces: Readings | None = None
+    model_error: ScoreTest | None = None
+    """Whether the model can be right, where corrections were given to test it with."""
 
     @property
     def sd(self) -> FloatArray:
@@ -136,7 +140,7 @@ class Identified:
     @property
     def statements(self) -> tuple[str, ...]:
         """What the data don't determine, and which unknowns are at their bounds, in words."""
-        scales, found = list[float](), list[str]()
+        scales, found = list[float](), [] if self.model_error is None else [str(self.model_error)]
         for (name, unknown), value in zip(self.unknowns.items(), self.values, strict=True):
             scales.append(unknown.scale(value))
             low, high = unknown.bounds
@@ -257,6 +261,7 @@ def identify(
     strains: Readings | None = None,
     levels: Sequence[Level] = LEVELS,
     finer: FinerMesh | None = None,
+    corrections: FloatArray | None = None,
     progress: Progress = silent,
 ) -> Identified:
     """Find the unknowns for which a model's states look like the data.
@@ -268,6 +273,8 @@ def identify(
     strains : readings of nominal strains; they count for states that are found by an amplitude.
     finer : a finer mesh, whose residual the last steps take, with this one's sensitivities; from
         both the values are extrapolated to elements of no size (Richardson).
+    corrections : (j, n, 2) of each state's nodal displacements that no law bounds [-], by which the
+        model is tested.
     InputError if the model has no states at the start.
     """
     if not any(data) and forces is None:
@@ -288,12 +295,13 @@ def identify(
         values = found.unknowns
     assert found is not None
     progress(len(stages), len(stages), "identify")
-    states, off = cost.states(values), np.zeros_like(values)
+    states, begin, factor = cost.states(values), values, 0.0
     if finer is not None:
-        begin = values
         values, states = _finished(cost, values, finer)
-        off = (values - begin) * finer.ratio**2 / (1.0 - finer.ratio**2)
-    result = _assessed(cost, values, states, replace(found, unknowns=values), off)
+        factor = finer.ratio**2 / (1.0 - finer.ratio**2)
+    off = (values - begin) * factor
+    found = replace(found, unknowns=values)
+    result = _assessed(cost, states, found, off, factor, corrections)
     return replace(result, values=values + off)
 
 
@@ -319,22 +327,42 @@ def _finished(
 
 
 def _assessed(
-    cost: _Cost, values: FloatArray, states: list[ModelState], found: Minimum, off: FloatArray
-) -> Identified:
-    """The result, with its covariances: by noise, and by the residual from block to block."""
+    cost: _Cost, states: list[ModelState], found: Minimum, off: FloatArray, factor: float,
+    corrections: FloatArray | None,
+) -> Identified:  # fmt: skip
+    """The result: covariances by noise and by the residual from block to block, test of the model.
+
+    factor : of the states' change by the finer mesh, for what that leaves.
+    """
+    values = found.unknowns
     found = replace(found, equations=cost.equations_at(states, values))
     inverse = ScaledEigen.of(found.equations.matrix).inverse()
-    shares = cost.state_equations(states)
-    scatter = np.zeros_like(inverse)
-    for share in shares:
-        scatter += share.blocks.T @ share.blocks
-    for r, J in cost.scalars(states, values):
-        scatter += max(1.0, r**2) * np.outer(J, J)
     known = np.isfinite(np.diag(inverse))
     half = np.where(np.outer(known, known), inverse, 0.0)
-    with_error = half @ scatter @ half
-    with_error[~known, ~known] = np.inf
+    coarse, shares = cost.states(values), cost.state_equations(states)
+    # Of parts of the body: noise of the reference and errors of the model are in all states.
+    blocks = np.zeros((max([len(s.blocks) for s in shares], default=0), len(values)))
+    for share in shares:
+        blocks[: len(share.blocks)] += share.blocks
+    scatter, scalars = blocks.T @ blocks, []
+    for (r, J), (r_coarse, _) in zip(
+        cost.scalars(states, values), cost.scalars(coarse, values), strict=True
+    ):
+        scatter += max(1.0, r**2) * np.outer(J, J)
+        scalars.append(Scalar(r, J, factor * (r - r_coarse)))
+    by_mesh = [
+        factor * (s.displacement - c.displacement) for s, c in zip(states, coarse, strict=True)
+    ]
+    readings = 0 if cost.forces is None else int(np.isfinite(cost.forces.values).sum())
+    joint = joint_score(cost.data, states, scalars, by_mesh, corrections, readings)
+    own = slice(len(values))
+    test = None
+    if corrections is not None:
+        test = score_test(*joint, len(values), (corrections**2).sum(axis=2).mean(axis=1))
+    matrices = half @ joint.noise[own, own] @ half, half @ scatter @ half
+    for matrix in matrices:
+        matrix[~known, ~known] = np.inf
     return Identified(
-        cost.unknowns, values, inverse, with_error, found, states, shares, cost.evaluations, off,
-        cost.forces,
+        cost.unknowns, values, *matrices, found, states, shares, cost.evaluations, off,
+        cost.forces, test,
     )  # fmt: skip

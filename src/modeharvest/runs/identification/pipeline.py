@@ -41,6 +41,7 @@ from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
+from modeharvest.idic.uncertainty.model_error import corrections
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
@@ -158,7 +159,9 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             states, data, unknowns | frame, pixel_size=px, forces=forces,
             levels=(*[Level(4, 3.0)] * (count > 0), *LEVELS),
             strains=Readings(np.array(experiment.strains), strain_sd),
-            finer=self._finer(list(unknowns), model.mesh), progress=self.progress,
+            finer=self._finer(list(unknowns), model.mesh),
+            corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
+            progress=self.progress,
         )  # fmt: skip
         solution = Solution(model.mesh, tuple(
             Snapshot(s.strain, s.displacement, s.force, negative_pivots=s.negative_pivots,
@@ -255,6 +258,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "command": f"modeharvest identify {self.source} --out {self.folder}",
             "parameters": parameters,
             "correlations": found.correlations,
+            "model_error": found.model_error,
             "statements": found.statements,
             "outcome": found.minimum.outcome.value,
             "explanation": found.minimum.outcome.explanation,
