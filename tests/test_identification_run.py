@@ -12,6 +12,7 @@ import pytest
 from documented_keys import undocumented
 
 from modeharvest.idic.local.field import LocalField, write_field
+from modeharvest.idic.uncertainty.parameters import compared_by_evidence
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.photographs.files import read_image, write_image
 from modeharvest.report.identification import identification_report
@@ -119,6 +120,37 @@ def test_files_of_images_or_of_fields_say_the_same(
 @pytest.mark.dolfinx
 def test_every_key_of_the_summary_is_documented(run: tuple[Path, dict[str, Any]]) -> None:
     assert undocumented(run[1], "identification.md") == set()
+
+
+@pytest.mark.dolfinx
+def test_several_laws_are_compared_by_their_evidence(tmp_path: Path) -> None:
+    """Before buckling two laws that fit are not told apart, and one too hard to compress is."""
+    other = {"name": "I1", "material": {"kind": "two-term-I1", "c1": 1.0, "c2": 0.1, "bulk": 9.0},
+             "unknowns": {"c1": {"start": 1.0, "bounds": [0.1, 5.0]},
+                          "bulk": {"start": 9.0, "bounds": [0.5, 50.0]}}}  # fmt: skip
+    hard = {"name": "hard", "material": {"kind": "ogden", "kappa": 50.0},
+            "unknowns": {"moduli[0]": BEFORE["unknowns"]["moduli[0]"]}}  # fmt: skip
+    summary = run_identification(BEFORE | {"laws": [other, hard]}, tmp_path)
+    laws = summary["laws"]
+    assert [law["name"] for law in laws] == ["Ogden", "I1", "hard"]
+    names = [[p["name"] for p in law["parameters"]] for law in laws]
+    assert names[1:] == [["c1", "bulk", "tilt"], ["moduli[0]", "tilt"]]
+    assert laws[0]["parameters"][0]["value"] == summary["parameters"][0]["value"]
+    evidence = [law["log_evidence"] for law in laws]
+    assert abs(evidence[0] - evidence[1]) < 1.0
+    assert max(evidence) > evidence[2] + 10.0
+    assert re.match("(Ogden and I1|I1 and Ogden) are not disting", summary["statements"][-1])
+    tables = {table.title: table for table in identification_report(summary).tables}
+    assert len(tables["Materials compared"].rows) == 3
+
+
+def test_evidence_in_words() -> None:
+    pair = ["Ogden", "I1"]
+    text = compared_by_evidence(pair, [(-90.0, 0.5), (-100.0, 1.0)], [False, True])
+    assert text.startswith("evidence for Ogden against I1 is decisive (the logarithm of")
+    text = compared_by_evidence(pair, [(-100.0, 3.0), (-98.0, 0.0)], [True, True])
+    assert text.startswith("I1 and Ogden are not distinguishable (the logarithm")
+    assert text.endswith("; but the test of model error rejects it, too")
 
 
 def test_the_shipped_case_is_one() -> None:

@@ -110,6 +110,10 @@ class Identified:
     mesh_error: FloatArray
     """(k,) taken for what the finer mesh leaves, and added to the values: from how far it moved
     them, as errors go with the square of the elements' size; 0 where there was no finer mesh."""
+    extrapolated: list[ModelState]
+    scalars: list[Scalar]
+    """States with elements of no size as the finer mesh lets expect them; residuals of forces,
+    strains and priors, with what the mesh makes of them."""
     forces: Readings | None = None
     model_error: ScoreTest | None = None
     """Whether the model can be right, where corrections were given to test it with."""
@@ -353,6 +357,9 @@ def _assessed(
     by_mesh = [
         factor * (s.displacement - c.displacement) for s, c in zip(states, coarse, strict=True)
     ]
+    limit = [
+        replace(s, displacement=s.displacement + e) for s, e in zip(states, by_mesh, strict=True)
+    ]
     readings = 0 if cost.forces is None else int(np.isfinite(cost.forces.values).sum())
     joint = joint_score(cost.data, states, scalars, by_mesh, corrections, readings)
     own = slice(len(values))
@@ -363,6 +370,35 @@ def _assessed(
     for matrix in matrices:
         matrix[~known, ~known] = np.inf
     return Identified(
-        cost.unknowns, values, *matrices, found, states, shares, cost.evaluations, off,
-        cost.forces, test,
+        cost.unknowns, values, *matrices, found, states, shares, cost.evaluations, off, limit,
+        scalars,        cost.forces, test,
     )  # fmt: skip
+
+
+def log_evidence(found: Identified, data: Sequence[StateObservation | None]) -> tuple[float, float]:
+    """Logarithm of a model's evidence but for what all models share; of it by the mesh.
+
+    Marginal likelihood by Laplace's method, unknowns without a prior uniform within their bounds:
+    MacKay, Neural Comput. 4 (1992) 415-447, doi 10.1162/neco.1992.4.3.415. Comparable with the same
+    prepared data, so after all models have been identified. The second number is what came in by
+    extrapolating to elements of no size.
+    """
+    H, costs = found.minimum.equations.matrix, list[float]()
+    for states, share in ((found.states, 0.0), (found.extrapolated, 1.0)):
+        gradient: FloatArray = np.zeros(len(H))
+        squares = 0.0
+        for part, state in zip(data, states, strict=True):
+            if part is not None:
+                here = part.equations(state)
+                gradient, squares = gradient + here.blocks.sum(axis=0), squares + here.squares
+        for scalar in found.scalars:
+            r = scalar.residual + share * scalar.by_mesh
+            gradient, squares = gradient - r * scalar.slopes, squares + r**2
+        # Unknowns would move to where the cost of these states is least.
+        costs.append(0.5 * float(squares - gradient @ ScaledEigen.of(H).solve(gradient)))
+    unknowns = found.unknowns.values()
+    sizes = [u.prior_sd or float(np.ptp(u.bounds)) / np.sqrt(2.0 * np.pi) for u in unknowns]
+    # An unknown that nothing determines has its bounds' width, and costs nothing.
+    bounded = np.diag([float(u.prior_sd is None) for u in unknowns])
+    occam = 0.5 * float(np.linalg.slogdet(H * np.outer(sizes, sizes) + bounded)[1])
+    return -costs[1] - occam, costs[0] - costs[1]

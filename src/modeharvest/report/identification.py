@@ -50,6 +50,8 @@ def identification_report(
             for name, row in zip(names, summary["correlations"], strict=True)]  # fmt: skip
     correlations = ReportTable(**caption("table-identified-correlations"),
                                columns=["", *names], rows=rows)  # fmt: skip
+    laws = summary["laws"]
+    compared = [ReportTable.of("identified-laws", map(_law_row, laws))] if laws else []
     states = ReportTable.of("identified-states", map(_state_row, summary["states"]))
     return Report(
         kind="identification",
@@ -65,8 +67,10 @@ def identification_report(
             for p in parameters[:6]
         ],
         sections=[
-            Section.of("identified", [*Card.tabular(table, wide=True),
-                                      *Card.tabular(correlations)]),
+            Section.of("identified", [
+                *Card.tabular(table, wide=True), *Card.tabular(correlations),
+                *(card for each in compared for card in Card.tabular(each, wide=True)),
+            ]),
             Section.of("identified-states", [
                 *_force_cards(summary, mesh), *_residual_cards(found, mesh, data),
                 *Card.tabular(states, wide=True),
@@ -94,6 +98,22 @@ def _row(p: Mapping[str, Any]) -> Mapping[str, Any]:
                             ("sd_with_model_error", 2), ("true", 5), ("start", 5))
     }  # fmt: skip
     return {**written, "name": p["name"] + unit, "off": off}
+
+
+def _law_row(law: Mapping[str, Any]) -> Mapping[str, Any]:
+    test = law["model_error"]
+    return {
+        "name": law["name"],
+        "evidence": f"{law['log_evidence']:.1f}",
+        "by_mesh": f"{law['log_evidence_by_mesh']:+.1f}",
+        "chi_squared": f"{test['chi_squared']:.4g}",
+        "degrees": test["degrees_of_freedom"],
+        "p_value": f"{test['p_value']:.2g}",
+        "parameters": ", ".join(
+            f"{p['name']} {Measured(p['value'], (p['sd_with_model_error'] or np.nan,))}"
+            for p in law["parameters"]
+        ),
+    }
 
 
 def _state_row(state: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -8,7 +8,7 @@ the values of what isn't unknown; ``[unknowns]``, each with its start and bounds
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -113,6 +113,15 @@ class TwinTruth:
         return None if found is None else float(found)
 
 
+@dataclass(frozen=True)
+class OtherLaw:
+    """Another material that the data are compared with, and its unknown constants."""
+
+    name: str
+    material: Material
+    unknowns: dict[str, Unknown]
+
+
 class IdentificationCase(CaseModel):
     """A model with unknowns, and the data that they are identified from."""
 
@@ -122,6 +131,8 @@ class IdentificationCase(CaseModel):
         Experiment()
     )
     unknowns: dict[str, Unknown]
+    laws: tuple[Annotated[OtherLaw, of_kind(MATERIALS, "laws.material", "material")], ...] = ()
+    """Other materials to be identified from the same data, and compared by their evidence."""
     data: MeasuredData | None = None
     twin: Annotated[TwinTruth | None, of_kind(MATERIALS, "twin.material", "material")] = None
     imaging: ImagingSpec = ImagingSpec()
@@ -155,11 +166,22 @@ class IdentificationCase(CaseModel):
                     )
         return self
 
+    def with_law(self, law: OtherLaw) -> IdentificationCase:
+        """The case with another material, whose constants take the places of this one's."""
+        own = vars(self.experiment.material)
+        rest = {n: u for n, u in self.unknowns.items() if n.partition("[")[0] not in own}
+        experiment = replace(self.experiment, material=law.material)
+        return self.model_copy(update={
+            "experiment": experiment, "unknowns": law.unknowns | rest, "laws": (),
+        })  # fmt: skip
+
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, materials by their kind."""
         content = super().plain()
         content["experiment"]["material"] = with_kind(self.experiment.material, MATERIALS)
         content["experiment"]["specimen"] = self.experiment.specimen.plain()
+        for law, table in zip(self.laws, content["laws"], strict=True):
+            table["material"] = with_kind(law.material, MATERIALS)
         if self.twin is not None:
             content["twin"]["material"] = with_kind(self.twin.material, MATERIALS)
         return content

@@ -27,6 +27,7 @@ from modeharvest.idic.finite_element.identify import (
     Readings,
     Unknown,
     identify,
+    log_evidence,
 )
 from modeharvest.idic.finite_element.observed import (
     MOTION,
@@ -42,6 +43,7 @@ from modeharvest.idic.local.field import read_field
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.idic.uncertainty.model_error import corrections
+from modeharvest.idic.uncertainty.parameters import compared_by_evidence
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
@@ -135,10 +137,34 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return [*images.files, path]
 
     def _identify(self) -> list[Path]:
-        experiment, unknowns = self.case.experiment, self.case.unknowns
-        model = self._model(experiment, list(unknowns))
+        model = self._model(self.case.experiment, list(self.case.unknowns))
         data, forces, px = self._data(model.mesh)
-        count = 0
+        found = self._identified(self.case, model, data, forces, px)
+        experiment = self.case.experiment
+        laws, comparison = self._laws(found, data, forces, px)
+        solution = Solution(model.mesh, tuple(
+            Snapshot(s.strain, s.displacement, s.force, negative_pivots=s.negative_pivots,
+                     branch=s.branch) for s in found.states
+        ), {"specimen": experiment.specimen.plain()})  # fmt: skip
+        names = ("solution.h5", "solution.vtu", "report.html", "summary.json")
+        h5, vtu, page, path = (self.folder / name for name in names)
+        solution.write(h5)
+        solution.write_vtu(vtu)
+        summary = self._summary(found, model)
+        summary |= to_plain({"laws": laws, "statements": [*found.statements, *comparison]})
+        from modeharvest.report.identification import identification_report
+        from modeharvest.report.model import write_page
+
+        write_page(identification_report(summary, found, model.mesh, data), page, self.progress)
+        write_json(path, summary)
+        return [h5, vtu, page, path]
+
+    def _identified(
+        self, case: IdentificationCase, model: Any, data: list[StateObservation | None],
+        forces: Readings | None, px: float,
+    ) -> Identified:  # fmt: skip
+        """A case's unknowns by the data."""
+        experiment, unknowns, count = case.experiment, case.unknowns, 0
         if self.case.data is not None and self.case.data.rigid_motion:
             count = len(experiment.strains)
         length = float(np.ptp(model.mesh.nodes[:, 0]))
@@ -155,33 +181,40 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             ] if count else found  # fmt: skip
 
         strain_sd = 1e-5 if self.case.data is None else self.case.data.strain_sd
-        found = identify(
+        return identify(
             states, data, unknowns | frame, pixel_size=px, forces=forces,
             levels=(*[Level(4, 3.0)] * (count > 0), *LEVELS),
             strains=Readings(np.array(experiment.strains), strain_sd),
-            finer=self._finer(list(unknowns), model.mesh),
+            finer=self._finer(experiment, list(unknowns), model.mesh),
             corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
             progress=self.progress,
         )  # fmt: skip
-        solution = Solution(model.mesh, tuple(
-            Snapshot(s.strain, s.displacement, s.force, negative_pivots=s.negative_pivots,
-                     branch=s.branch) for s in found.states
-        ), {"specimen": experiment.specimen.plain()})  # fmt: skip
-        names = ("solution.h5", "solution.vtu", "report.html", "summary.json")
-        h5, vtu, page, path = (self.folder / name for name in names)
-        solution.write(h5)
-        solution.write_vtu(vtu)
-        summary = self._summary(found, model)
-        from modeharvest.report.identification import identification_report
-        from modeharvest.report.model import write_page
 
-        write_page(identification_report(summary, found, model.mesh, data), page, self.progress)
-        write_json(path, summary)
-        return [h5, vtu, page, path]
+    def _laws(self, found: Identified, *data: Any) -> tuple[list[dict[str, Any]], list[str]]:
+        """The evidence for each of the case's materials, and which is the best, in words."""
+        results = {type(self.case.experiment.material).__name__: found}
+        for law in self.case.laws:
+            case = self.case.with_law(law)
+            model = self._model(case.experiment, list(case.unknowns))
+            results[law.name] = self._identified(case, model, *data)
+        if len(results) == 1:
+            return [], []
+        # All by the same weights, those of the last.
+        evidence = [log_evidence(result, data[0]) for result in results.values()]
+        rejected = [bool(r.model_error and r.model_error.is_rejected) for r in results.values()]
+        text = compared_by_evidence(list(results), evidence, rejected)
+        return [
+            {"name": name, "log_evidence": log, "log_evidence_by_mesh": by_mesh,
+             "model_error": result.model_error, "outcome": result.minimum.outcome.value,
+             "parameters": [
+                 {"name": n, "value": value, "sd_with_model_error": sd} for n, value, sd
+                 in zip(result.unknowns, result.values, result.sd_with_model_error, strict=True)
+             ]}
+            for (name, result), (log, by_mesh) in zip(results.items(), evidence, strict=True)
+        ], [text]  # fmt: skip
 
-    def _finer(self, names: list[str], mesh: Mesh) -> FinerMesh:
+    def _finer(self, experiment: Experiment, names: list[str], mesh: Mesh) -> FinerMesh:
         """The states on a finer mesh, at this mesh's nodes."""
-        experiment = self.case.experiment
         size = self.case.finer_mesh_size or 0.6 * experiment.mesh_size
         model = self._model(replace(experiment, mesh_size=size), names)
 
@@ -259,7 +292,6 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "parameters": parameters,
             "correlations": found.correlations,
             "model_error": found.model_error,
-            "statements": found.statements,
             "outcome": found.minimum.outcome.value,
             "explanation": found.minimum.outcome.explanation,
             "critical_strain": model.critical_strain,
