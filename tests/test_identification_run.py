@@ -11,10 +11,16 @@ import numpy as np
 import pytest
 from documented_keys import undocumented
 
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Snapshot, Solution
+from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.idic.uncertainty.parameters import compared_by_evidence
-from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.distortion.files import write_distortion
+from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.photographs.files import read_image, write_image
+from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.report.identification import identification_report
 from modeharvest.runs.case import Case
 from modeharvest.runs.identification.case import IdentificationCase
@@ -117,6 +123,87 @@ def test_files_of_images_or_of_fields_say_the_same(
             assert abs(p["value"] - q["true"]) < 4.0 * p["sd_with_model_error"]
 
 
+def as_seen(lens: CameraDistortion, shape: tuple[int, int]) -> PolynomialDistortion:
+    """A camera that is turned by 1 degree and 11 and 14 px off, behind a lens of degree 3."""
+    row, col = (i.ravel() for i in np.indices(shape)[:, ::10, ::10])
+    y, x = row - 0.5 * (shape[0] - 1), col - 0.5 * (shape[1] - 1)
+    c, s = np.cos(np.radians(1.0)), np.sin(np.radians(1.0))
+    at = np.stack([row - y + c * y - s * x - 11.0, col - x + s * y + c * x + 14.0])
+    off = np.stack(lens.observed(*at)) - [row, col]
+    basis = PolynomialDistortion(shape, np.zeros((2, 10))).basis(row, col)
+    return PolynomialDistortion(shape, np.linalg.lstsq(basis, off.T)[0].T)
+
+
+@pytest.mark.dolfinx
+def test_photographs_off_the_middle_of_another_light_and_through_a_lens(tmp_path: Path) -> None:
+    from modeharvest.fem.meshing import mesh_specimen
+    from modeharvest.fem.path.parametric import ParametricTest
+
+    experiment = Experiment(Specimen(**SPECIMEN), strains=(0.03, 0.05), mesh_size=0.5)
+    mesh, lens = mesh_specimen(experiment.specimen, 0.5), CameraDistortion(900, 900, 130, 80, 0.2)
+    states = ParametricTest(experiment, ("tilt",), mesh).at(np.array([0.1]), False)
+    snapshots = tuple(Snapshot(s.strain, s.displacement) for s in states)
+    write_distortion(tmp_path / "seen.json", as_seen(lens, (170, 262)))
+    write_distortion(tmp_path / "lens.json", lens)
+    imaging = ImagingSpec(
+        pixel_size=0.05, shape=(170, 262), margin_px=0, distortion=str(tmp_path / "seen.json")
+    )
+    images = make_images(Solution(mesh, snapshots), imaging, tmp_path / "images", (0.03, 0.05))
+    random = np.random.default_rng(0)
+    for name, image in (("f", images.reference()), ("g1", images.deformed(0.03)),
+                        ("g2", images.deformed(0.05))):  # fmt: skip
+        grey = image if name == "f" else 0.8 * image + 0.08
+        write_image(tmp_path / f"{name}.tif", grey + random.normal(0.0, 0.01, grey.shape))
+    data = {"reference": "f.tif", "deformed": ["g*.tif"], "pixel_size": 0.05, "noise_sd": 0.01,
+            "distortion": "lens.json", "forces_N_per_mm": [s.force for s in states],
+            "force_sd": 0.002}  # fmt: skip
+    tables = {key: value for key, value in BEFORE.items() if key not in ("twin", "imaging")}
+
+    def identified(**more: object) -> dict[str, Any]:
+        case = IdentificationCase.model_validate(tables | {"data": data | more})
+        case._base = tmp_path
+        return run_identification(case, tmp_path / "out")
+
+    found = identified()["parameters"]
+    assert [p["name"] for p in found[3:]] == ["centre_x", "centre_y", "orientation"]
+    assert [p["unit"] for p in found[3:]] == ["mm", "mm", "rad"]
+    true = [1.2, 5.4, 0.1, 0.7, 0.55, np.radians(1.0)]
+    for p, exact in zip(found, true, strict=True):
+        assert abs(p["value"] - exact) < 4.0 * p["sd_with_model_error"]
+    assert abs(found[3]["start"] - 0.7) < 0.02  # holes say so, to 0.4 px
+    with pytest.raises(InputError, match=r"place of the specimen in the reference: .* a cell size"):
+        identified(pixel_size=0.07)
+    with pytest.raises(InputError, match=r"none\.json"):
+        identified(distortion="none.json")
+
+
+@pytest.mark.dolfinx
+def test_larger_holes_and_a_bowed_edge_are_found(tmp_path: Path) -> None:
+    """On a mesh that isn't the data's, of a specimen whose holes are scattered, too."""
+    unknowns = {"moduli[0]": {"start": 2.4, "bounds": [0.1, 10.0]},
+                "kappa": {"start": 2.7, "bounds": [0.5, 50.0]},
+                "holes.diameter[0,0]": {"start": 0.0, "bounds": [-0.1, 0.1]},
+                "holes[1].y": {"start": 0.0, "bounds": [-0.05, 0.05]},
+                "right.x[2]": {"start": 0.0, "bounds": [-1.0, 1.0]}}  # fmt: skip
+    twin = {"mesh_size": 0.5, "force_sd": 0.002, "force_seed": 3,
+            "values": {"holes.diameter[0,0]": 0.04, "holes[1].y": 0.02, "right.x[2]": 0.3},
+            "imperfection": {"position_sd": 1e-4, "diameter_sd": 1e-4}}  # fmt: skip
+    summary = run_identification(BEFORE | {"unknowns": unknowns, "twin": twin}, tmp_path)
+    assert summary["outcome"] == "converged"
+    require_truth(summary)
+    true = {p["name"]: p["true"] for p in summary["parameters"]}
+    assert true["right.x[2]"] == 0.3
+    assert true["holes.diameter[0,0]"] == pytest.approx(0.04, abs=1e-3)
+    assert {p["unit"] for p in summary["parameters"][2:]} == {"mm"}
+    hole = summary["holes"][1]
+    assert hole["centre"] == pytest.approx([-2.85, 0.95])
+    assert hole["off"][1:] == [p["value"] for p in summary["parameters"][3:1:-1]]
+    assert hole["true"][1] == pytest.approx(0.02, abs=1e-3)
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert 'id="holes"' in page
+    assert undocumented(summary, "identification.md") == set()
+
+
 @pytest.mark.dolfinx
 def test_every_key_of_the_summary_is_documented(run: tuple[Path, dict[str, Any]]) -> None:
     assert undocumented(run[1], "identification.md") == set()
@@ -180,6 +267,13 @@ def test_the_shipped_case_is_one() -> None:
         ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, **FORCES, "force_sd": None}},
          "expected force_sd with forces"),
         ({"finer_mesh_size": 0.6}, "expected finer_mesh_size [mm] above 0 and at most 0.495"),
+        ({"unknowns": {"holes[8].x": {"start": 0.0, "bounds": [-0.1, 0.1]}}},
+         "expected a hole from 0 to 7 in holes[8].x, got 8"),
+        ({"twin": {"values": {"bow": 0.1}}}, "got 'bow'"),
+        ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, "distortion": "lens.json"}},
+         "expected images for the distortion of a lens, got fields"),
+        ({"data": {"reference": "f.tif", "deformed": ["g.tif", "h.tif"], "pixel_size": 0.1,
+                   "light_degree": 9}}, "data: expected light_degree of 0 to 6, got 9"),
         ({"twin": None}, "expected a table [data] or a table [twin]"),
     ],
 )  # fmt: skip

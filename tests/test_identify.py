@@ -6,7 +6,8 @@ exact at every point.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,9 +23,17 @@ from modeharvest.idic.finite_element.identify import (
     identify,
 )
 from modeharvest.idic.finite_element.mesh import quadratic
-from modeharvest.idic.finite_element.observed import MOTION, FieldData, ImageData, rigidly_moved
+from modeharvest.idic.finite_element.observed import (
+    MOTION,
+    PLACE,
+    FieldData,
+    ImageData,
+    imaged,
+    rigidly_moved,
+)
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
+from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.idic.uncertainty.model_error import corrections
@@ -60,6 +69,8 @@ class State:
     displacement_by: FloatArray
     force_by: FloatArray
     strain_by: FloatArray
+    nodes_by: FloatArray = field(default_factory=lambda: np.zeros((3, *MESH.nodes.shape)))
+    mesh: Mesh = MESH
 
 
 def model(values: FloatArray) -> list[State]:
@@ -152,8 +163,7 @@ def test_a_camera_that_has_moved() -> None:
 
     def moved(values: FloatArray) -> list[State]:
         own, motion = values[:3], values[3:].reshape(2, 3)
-        return [rigidly_moved(s, MESH.nodes, m, k, 2)  # type: ignore[misc, arg-type]
-                for k, (s, m) in enumerate(zip(model(own), motion, strict=True))]  # fmt: skip
+        return [imaged(s, None, motion, k) for k, s in enumerate(model(own))]  # type: ignore[misc, arg-type]
 
     x, y = np.meshgrid(GRID.x, GRID.y)
     rng, f, data = np.random.default_rng(0), pattern(x, y), []
@@ -170,6 +180,34 @@ def test_a_camera_that_has_moved() -> None:
     exact = np.append(TRUE, motions.ravel())
     assert np.all(np.abs(found.values - exact) < 4.5 * found.sd)
     assert np.all(found.sd[3:] < 0.05 * GRID.pixel_size)
+
+
+def test_a_specimen_that_is_not_in_the_middle_under_a_light_that_changes() -> None:
+    """15 px off, and turned: the place is an unknown, too; found whatever gain and offset are."""
+    place = np.array([0.5, -0.35, 0.02])
+    off = place + np.array([0.04, -0.03, 0.005])  # what it starts from: 1 px
+
+    def placed(values: FloatArray) -> list[State]:
+        return [imaged(s, values[3:], np.zeros((0, 3)), k) for k, s in enumerate(model(values[:3]))]  # type: ignore[misc, arg-type]
+
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    (tx, ty), c, s = place[:2], np.cos(place[2]), np.sin(place[2])
+    X, Y = c * (x - tx) + s * (y - ty), -s * (x - tx) + c * (y - ty)
+    rng, noise = np.random.default_rng(0), ImageNoise(NOISE, 0.8 * NOISE)
+    start = rigidly_moved(MESH.nodes, np.zeros((0, *MESH.nodes.shape)), off)[0]
+    pixels, data = MeshPixels(replace(MESH, nodes=start)), []
+    for e in LOADS:
+        gx, gy = X / (1 + e * TRUE[0]), Y / (1 + e * TRUE[0] * TRUE[1])
+        f, g = (pattern(a, b) + rng.normal(0.0, NOISE, GRID.shape) for a, b in ((X, Y), (gx, gy)))
+        pair = ImagePair(f, 0.8 * g + 0.05, GRID)  # type: ignore[arg-type]
+        data.append(ImageData(pair, pixels, noise, partial(alike, degree=0)))
+    where = {n: Unknown(v, (v - 0.2, v + 0.2)) for n, v in zip(PLACE, off, strict=True)}
+    found = identify(placed, data, UNKNOWNS | where, pixel_size=0.04, forces=FORCES)  # type: ignore[arg-type]
+    assert np.all(np.abs(found.values - np.append(TRUE, place)) < 4.0 * found.sd)
+    assert np.all(found.sd[3:] < [0.01, 0.01, 0.01])
+    assert found.statements == ()
+    for share in found.state_equations:
+        assert share.residual == pytest.approx(share.expected, rel=0.03)
 
 
 def test_a_displacement_field_instead_of_images() -> None:
@@ -259,8 +297,8 @@ def test_what_a_mesh_is_wrong_by_does_not_make_a_law_wrong() -> None:
     def by_mesh(values: FloatArray) -> list[State]:
         return [replace(s, displacement=s.displacement + shear) for s in model(values)]
 
-    def finer(values: FloatArray) -> list[tuple[FloatArray, float]]:
-        return [(s.displacement + 0.25 * shear, s.force) for s in model(values)]
+    def finer(values: FloatArray) -> list[State]:
+        return [replace(s, displacement=s.displacement + 0.25 * shear) for s in model(values)]
 
     given = {"pixel_size": 0.04, "corrections": CORRECTIONS, "forces": FORCES}
     found = identify(
@@ -277,8 +315,8 @@ def test_a_finer_mesh_has_the_last_word() -> None:
     """
     shift = np.array([1e-3, 0.01, 0.02])
 
-    def states(values: FloatArray) -> list[tuple[FloatArray, float]]:
-        return [(s.displacement, s.force) for s in model(values + shift)]
+    def states(values: FloatArray) -> list[State]:
+        return model(values + shift)
 
     plain = found_from(0, levels=(FULL,))
     found = found_from(0, levels=(FULL,), finer=FinerMesh(states, 0.5))

@@ -22,7 +22,8 @@ from modeharvest.util.errors import InputError
 TRAVEL, TILT = "travel", "tilt"
 """Unknowns of the loaded edges: a factor of all nominal strains [-], and the tilt of the edge at
 x > 0 per nominal strain [rad]."""
-_PARTS = ("x", "y", "diameter")
+PARTS = ("x", "y", "diameter")
+"""Of a hole."""
 _PART, _DEGREE = "(x|y|diameter)", r"(\d+)"
 _OWN = re.compile(rf"holes\[(\d+)\]\.{_PART}")
 _SMOOTH = re.compile(rf"holes\.{_PART}\[{_DEGREE}, ?{_DEGREE}\]")
@@ -90,10 +91,10 @@ def parameter(name: str, experiment: Experiment) -> Parameter:
     if found := _OWN.fullmatch(name):
         number, holes = int(found[1]), np.zeros((len(spec.hole_centres), 3))
         _require(name, "a hole", number, len(holes))
-        holes[number, _PARTS.index(found[2])] = 1.0
+        holes[number, PARTS.index(found[2])] = 1.0
         return Parameter("mm", holes=holes, is_symmetric=False)
     if found := _SMOOTH.fullmatch(name):
-        degrees, part = (int(found[2]), int(found[3])), _PARTS.index(found[1])
+        degrees, part = (int(found[2]), int(found[3])), PARTS.index(found[1])
         _require(name, "a degree", max(degrees), _HIGHEST + 1)
         where = (spec.hole_centres / spec.cellular_half_size).T
         along, across = (Legendre.basis(d)(s) for d, s in zip(degrees, where, strict=True))

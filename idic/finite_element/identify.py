@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from modeharvest.idic.finite_element.observed import ImageData, StateEquations, StateObservation
+from modeharvest.idic.finite_element.observed import (
+    ImageData,
+    StateEquations,
+    StateObservation,
+    at_fixed_points,
+    displacement_at,
+)
 from modeharvest.idic.finite_element.score import Scalar, joint_score
 from modeharvest.idic.solver.assembly import NormalEquations
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, minimise
@@ -50,8 +56,8 @@ Model = Callable[[FloatArray], "Sequence[ModelState]"]
 class FinerMesh(NamedTuple):
     """What the same states are on a finer mesh."""
 
-    states: Callable[[FloatArray], Sequence[tuple[FloatArray, float]]]
-    """For values of the unknowns (k,): u (n, 2) at the model's own nodes [mm], force [N/mm]."""
+    model: Model
+    """Of the same states; their derivatives are of no account."""
     ratio: float
     """Of its elements' size to that of the model's own [-]."""
 
@@ -185,7 +191,10 @@ class _Cost:
         key = values.tobytes()
         if key not in self._states:
             self.evaluations += 1
-            self._states = {**dict(list(self._states.items())[-2:]), key: list(self.model(values))}
+            self._states = {
+                **dict(list(self._states.items())[-2:]),
+                key: [at_fixed_points(s) for s in self.model(values)],
+            }
         return self._states[key]
 
     def state_equations(self, states: Sequence[ModelState]) -> list[StateEquations]:
@@ -316,8 +325,8 @@ def _finished(
     bounds = np.array([u.bounds for u in cost.unknowns.values()])
     for _ in range(_ROUNDS):
         states = [
-            replace(state, displacement=u, force=force)
-            for state, (u, force) in zip(cost.states(values), finer.states(values), strict=True)
+            replace(state, displacement=displacement_at(fine, state.mesh.nodes), force=fine.force)
+            for state, fine in zip(cost.states(values), finer.model(values), strict=True)
         ]
         here = cost.equations_at(states, values)
         eigen = ScaledEigen.of(here.matrix)

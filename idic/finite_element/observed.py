@@ -1,25 +1,28 @@
 """What is observed of a state, images or displacements, against a model's nodal displacements.
 
 A pixel x in an element has J = grad g(x + u) . sum N_a S_a, with the sensitivities S = du/dp of the
-nodes to a model's parameters. So their normal equations are those of the nodes, projected.
+nodes to a model's parameters. So their normal equations are those of the nodes, projected. Where
+parameters move nodes by X', a pixel sees of u' at nodes only S = u' - grad u . X': a point of the
+material stays where the reference shows it. Pixels are sorted by elements anew on every level.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.fields import determinant, element_gradients
+from modeharvest.idic.finite_element.fields import determinant, element_gradients, mean_around
 from modeharvest.idic.finite_element.pixels import (
     MeshPixels,
     NodalEquations,
     images_on,
     normal_equations,
 )
-from modeharvest.idic.finite_element.result import located
+from modeharvest.idic.finite_element.result import located, nodal_values
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, eroded
@@ -60,6 +63,10 @@ class StateEquations:
     """Correlation with the noise of another state's share, by a reference that both have."""
 
 
+Light = Callable[[ImagePair, Mesh, FloatArray], ImagePair]
+"""A pair with brightness and contrast alike, of a pair, a mesh and displacements (n, 2) [mm]."""
+
+
 class StateObservation(Protocol):
     """What is known of one state apart from force and strain."""
 
@@ -73,23 +80,38 @@ class StateObservation(Protocol):
 class ImageData:
     """A pair of images of a state, compared on the pixels that the model's mesh covers.
 
+    pixels : of the model's mesh where it is at first.
     noise : of the two; by default that of the reference there, estimated, in both.
+    light : what makes g(x + u) as bright as f, before each level; None for images of one light.
     """
 
     def __init__(
-        self, pair: ImagePair, pixels: MeshPixels, noise: ImageNoise | None = None
-    ) -> None:
-        mesh, grid = pixels.mesh, pair.grid
-        covered = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the model").mask
-        self.pair = replace(pair, mask=covered & pair.masks[0])
+        self, pair: ImagePair, pixels: MeshPixels, noise: ImageNoise | None = None,
+        light: Light | None = None,
+    ) -> None:  # fmt: skip
+        self._given = pair
+        self._sort(pixels)
         estimate = estimated_noise(pair.reference, self.pair.masks[0]).sd
-        self.pixels, self.noise = pixels, noise or ImageNoise.of(estimate)
+        self.noise, self._light = noise or ImageNoise.of(estimate), light
         self.order = spline_order(speckle_size(pair.reference, self.pair.mask))
-        self.block = _blocks(mesh)
+        self.block = _blocks(pixels.mesh)
+
+    def _sort(self, pixels: MeshPixels) -> None:
+        """Take the pixels that a mesh covers."""
+        mesh, self.pixels = pixels.mesh, pixels
+        grid = self._given.grid
+        covered = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the model").mask
+        self.pair = replace(self._given, mask=covered & self._given.masks[0])
 
     def prepare(self, level: Level, state: ModelState) -> None:
         """Images of a level; on a coarse one what the residual is weighs it, not its noise."""
+        if not np.array_equal(state.mesh.nodes, self.pixels.mesh.nodes):
+            self._sort(MeshPixels(state.mesh))
         order, mesh, pair = self.order if level == FULL else 5, self.pixels.mesh, self.pair
+        light = 1.0  # gain of the deformed image
+        if self._light is not None:
+            pair = self._light(pair, mesh, state.displacement)
+            light = float(np.std(pair.deformed) / np.std(self.pair.deformed))
         if level == FULL:  # beyond the material that the model shows there, g is continued
             at = mesh.nodes + state.displacement
             shown = locate(at, mesh.cells, mesh.element, pair.grid, "deformed mesh").mask
@@ -112,7 +134,7 @@ class ImageData:
         gradients = element_gradients(mesh, u)
         det = np.maximum(determinant(np.eye(2) + gradients.mean(axis=1)), _LEAST_DET)
         transfer = NoiseTransfer.at(u[mesh.cells].mean(axis=1) / px, det, self.order)
-        f, g = self.noise.reference**2, self.noise.deformed**2
+        f, g = self.noise.reference**2, (light * self.noise.deformed) ** 2
         slopes = float(nodal.blocks[:, [0, 2]].sum()) / nodal.pixels  # mean of |grad g|^2
         share = min(2.0 * g * transfer.slope / px**2 / slopes, _MOST_NOISE)
         self._expected = float(np.sqrt(f + g * transfer.value))
@@ -123,7 +145,8 @@ class ImageData:
         self._weight, self._shared = self._gain**2 / noise, self._gain * f / noise
 
     def _nodal(self, state: ModelState) -> NodalEquations:
-        return normal_equations(self._own, self.pixels.mesh, self._images, state.displacement)
+        mesh = self.pixels.mesh
+        return normal_equations(self._own, mesh, self._images, displacement_at(state, mesh.nodes))
 
     def equations(self, state: ModelState) -> StateEquations:
         """Projected from those of the nodes' displacements."""
@@ -149,7 +172,7 @@ class ImageData:
         found = np.full(self._images.grid.shape, np.nan)
         element = np.repeat(np.arange(len(mesh.cells)), np.diff(own.start))
         N = shape_functions("T6", own.xi.T.astype(np.float64))
-        u = np.einsum("pa,pai->pi", N, state.displacement[mesh.cells[element]])
+        u = np.einsum("pa,pai->pi", N, displacement_at(state, mesh.nodes)[mesh.cells[element]])
         px = self._images.grid.pixel_size
         g, *_ = self._images.deformed.sample(own.row - u[:, 1] / px, own.col + u[:, 0] / px)
         found[own.row, own.col] = own.grey - g
@@ -166,21 +189,28 @@ class FieldData:
     def __init__(
         self, points: FloatArray, u: FloatArray, sd: FloatArray | float, mesh: Mesh
     ) -> None:
-        element, xi = located(mesh, points)
+        element, _ = located(mesh, points)
         inside = (element >= 0) & np.isfinite(u).all(axis=1)
         if not inside.any():
             raise InputError("expected displacements at points of the specimen, got none there")
-        self._nodes = mesh.cells[element[inside]]
-        self._N = shape_functions(mesh.element, xi[inside])
+        self._points = np.asarray(points, np.float64)[inside]
         self._u = np.asarray(u, np.float64)[inside]
         self._w = 1.0 / np.broadcast_to(np.asarray(sd, np.float64), u.shape)[inside] ** 2
         self._block = _blocks(mesh)[element[inside]]
+        self._sort(mesh)
+
+    def _sort(self, mesh: Mesh) -> None:
+        element, xi = located(mesh, self._points, beside=True)
+        self._mesh, self._nodes = mesh, mesh.cells[element]
+        self._N = shape_functions(mesh.element, xi)
 
     def prepare(self, level: Level, state: ModelState) -> None:
         """Nothing: displacements have no levels."""
 
     def equations(self, state: ModelState) -> StateEquations:
         """By differences of displacements at the points."""
+        if not np.array_equal(state.mesh.nodes, self._mesh.nodes):
+            self._sort(state.mesh)
         left = self._u - np.einsum("pa,pai->pi", self._N, state.displacement[self._nodes])
         J = np.einsum("pa,kpai->kpi", self._N, state.displacement_by[:, self._nodes])
         blocks = np.zeros((self._block.max() + 1, len(J)))
@@ -193,38 +223,70 @@ class FieldData:
         )  # fmt: skip
 
 
+PLACE = ("centre_x", "centre_y", "orientation")
+"""Unknowns of where the reference shows the specimen: its middle [mm], about which it is turned
+[rad]."""
 MOTION = ("shift_x", "shift_y", "turn")
-"""Unknowns of the camera's frame in each state: of the specimen's middle [mm], about it [rad]."""
+"""Unknowns of the camera's frame in each state: a shift [mm], and a turn about the origin [rad]."""
 
 
-def rigidly_moved(
-    state: ModelState, nodes: FloatArray, motion: FloatArray, number: int, count: int
+def imaged(
+    state: ModelState, place: FloatArray | None, motions: FloatArray, number: int
 ) -> ModelState:
-    """A state as a camera sees it that has moved: turned about the origin and shifted.
+    """A state as a camera sees it: put where the reference shows it, by a camera that has moved.
 
-    motion : (3,) of this state, in the order of MOTION.
-    number, count : of this state and of all: derivatives by the motions of all are put behind the
-        model's own, and are zero for those of other states.
+    place : (3,) in the order of PLACE; None for a specimen in the middle.
+    motions : (count, 3) of all states in the order of MOTION; (0, 3) for a camera at rest.
+    number : of this state. Derivatives by place and motions are put behind the model's own, and are
+        zero for motions of other states.
     """
-    u, by_turn, R = superposed_motion(state.displacement, nodes, motion)
-    own = np.zeros((3 * count, *nodes.shape))
-    own[3 * number : 3 * number + 3] = (*np.broadcast_to(np.eye(2)[:, None], (2, *nodes.shape)),
-                                        by_turn)  # fmt: skip
-    rest = np.zeros(3 * count)
+    mesh, X_by = state.mesh, state.nodes_by
+    x, x_by = mesh.nodes + state.displacement, X_by + state.displacement_by
+    if place is not None:
+        (X, X_by), (x, x_by) = rigidly_moved(mesh.nodes, X_by, place), rigidly_moved(x, x_by, place)
+        mesh = replace(mesh, nodes=X)
+    none = np.zeros((motions.size, *x.shape))
+    if len(motions):
+        x, x_by = rigidly_moved(x, x_by, motions[number])
+        own, first = len(X_by), 3 * number
+        x_by = np.concatenate([x_by[:own], none[:first], x_by[own:], none[first + 3 :]])
+        X_by = np.concatenate([X_by, none])
+    rest = np.zeros(len(X_by) - len(state.force_by))
     return replace(
-        state, displacement=u, displacement_by=np.concatenate([state.displacement_by @ R.T, own]),
-        force_by=np.append(state.force_by, rest), strain_by=np.append(state.strain_by, rest),
+        state, mesh=mesh, displacement=x - mesh.nodes, displacement_by=x_by - X_by,
+        nodes_by=X_by, force_by=np.append(state.force_by, rest),
+        strain_by=np.append(state.strain_by, rest),
     )  # fmt: skip
 
 
-def superposed_motion(
-    u: FloatArray, nodes: FloatArray, motion: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(n, 2) displacement with the camera's motion in it, its derivative by the turn, and R."""
+def rigidly_moved(
+    points: FloatArray, by: FloatArray, motion: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 2) turned about the origin, then shifted; their derivatives (k + 3, n, 2).
+
+    by : (k, n, 2) of the points by parameters, behind which those by the motion are put.
+    motion : (3,) shift along x and y [mm] and turn [rad].
+    """
     c, s = np.cos(motion[2]), np.sin(motion[2])
     R, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
-    at = nodes + u
-    return at @ R.T + motion[:2] - nodes, at @ slope.T, R
+    shifts = np.broadcast_to(np.eye(2)[:, None], (2, *points.shape))
+    return points @ R.T + motion[:2], np.concatenate([by @ R.T, shifts, [points @ slope.T]])
+
+
+def displacement_at(state: ModelState, nodes: FloatArray) -> FloatArray:
+    """(n, 2) a state's displacement where the nodes of another mesh are, continued into holes."""
+    if np.array_equal(state.mesh.nodes, nodes):
+        return state.displacement
+    return nodal_values(state.mesh, state.displacement, nodes, beside=True)
+
+
+def at_fixed_points(state: ModelState) -> ModelState:
+    """A state whose derivatives are those of u at points of the material where nodes are now."""
+    if not state.nodes_by.any():
+        return state
+    slopes = mean_around(state.mesh, element_gradients(state.mesh, state.displacement))
+    by = state.displacement_by - np.einsum("nij,knj->kni", slopes, state.nodes_by)
+    return replace(state, displacement_by=by, nodes_by=state.nodes_by[:0])
 
 
 def _blocks(mesh: Mesh) -> IntArray:

@@ -90,9 +90,9 @@ def displacement_from(
 
     def seen(off_px: float) -> ImagePair:
         """The images alike, less what shows background where edges are off by so much."""
-        alike = _alike(pair, mesh, u, light_degree)
+        pair_alike = alike(pair, mesh, u, light_degree)
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
-        return replace(alike, deformed_mask=mask)
+        return replace(pair_alike, deformed_mask=mask)
 
     unknown = len(start)
     for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
@@ -197,8 +197,8 @@ def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) ->
     return inner if inner.any() else None
 
 
-def _alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
-    """The pair with its brightness and contrast alike, in the reference's grey levels."""
+def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
+    """The pair with brightness and contrast alike, in the reference's levels; u (n, 2) [mm]."""
     at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
     gain, offset = brightness(pair, np.moveaxis(at, 0, -1), degree)
     a, b = gain.mean(), offset.mean()

@@ -15,7 +15,7 @@ from modeharvest.idic.finite_element.observed import ImageData, StateObservation
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
-from modeharvest.report.figures.style import BLUE, RED
+from modeharvest.report.figures.style import BLUE, EDGE, GOLD, RED
 from modeharvest.report.model import (
     Card,
     KeyNumber,
@@ -30,6 +30,7 @@ from modeharvest.report.model import (
 )
 
 Summary = Mapping[str, Any]
+_HOLES_SHOWN = 0.15  # of a diameter: as which the largest change of a hole is drawn, about
 
 
 def identification_report(
@@ -70,6 +71,7 @@ def identification_report(
             Section.of("identified", [
                 *Card.tabular(table, wide=True), *Card.tabular(correlations),
                 *(card for each in compared for card in Card.tabular(each, wide=True)),
+                *_hole_cards(summary),
             ]),
             Section.of("identified-states", [
                 *_force_cards(summary, mesh), *_residual_cards(found, mesh, data),
@@ -148,6 +150,35 @@ def _draw_force(states: Sequence[Mapping[str, Any]], reading_sd: float | None) -
                       capsize=2.5, elinewidth=1, label="measured")  # fmt: skip
     legend_above(axes)
     axes.set(xlim=(0, None), ylim=(0, None))
+    return drawn
+
+
+def _hole_cards(summary: Summary) -> list[Card]:
+    holes = summary["holes"]
+    if holes is None:
+        return []
+    off = np.array([hole["off"] for hole in holes])
+    largest = max(np.abs(off[:, :2]).max(), 0.5 * np.abs(off[:, 2]).max(), 1e-12)
+    times = float(f"{_HOLES_SHOWN * holes[0]['diameter'] / largest:.1g}")
+    figure = ReportFigure("holes", "", partial(_draw_holes, holes, times))
+    sd = np.array([hole["off_sd"] for hole in holes])
+    text = text_of("identified-holes", times=times, sd=1e3 * np.sqrt(np.mean(sd**2, axis=0)))
+    return [Card("Holes as found", [figure], caption=text)]
+
+
+def _draw_holes(holes: Sequence[Mapping[str, Any]], times: float) -> Figure:
+    drawn, axes = curve("x [mm]", "y [mm]")
+    turn = np.linspace(0.0, 2.0 * np.pi, 49)
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    for what, colour, style in (("", EDGE, "--"), ("true", GOLD, "-"), ("off", BLUE, "-")):
+        for hole in holes:
+            if what and hole[what] is None:
+                continue
+            x, y, growth = times * np.array(hole[what]) if what else np.zeros(3)
+            middle = np.add(hole["centre"], (x, y))
+            edge = middle[:, None] + 0.5 * (hole["diameter"] + growth) * circle
+            axes.plot(*edge, style, color=colour, lw=0.8)
+    axes.set_aspect("equal")
     return drawn
 
 

@@ -17,7 +17,10 @@ from pydantic import PrivateAttr, model_validator
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
+from modeharvest.fem.path.parameters import PARTS, TILT, TRAVEL, parameter
+from modeharvest.fem.specimen import Imperfection
 from modeharvest.idic.finite_element.identify import Readings, Unknown
+from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
 from modeharvest.util.errors import InputError, require_within
@@ -31,7 +34,16 @@ class MeasuredData:
     deformed: tuple[str, ...] = ()
     """Images: of the undeformed state, and of each strain in the order of the test."""
     pixel_size: float | None = None
-    """[mm/px]; the specimen's middle is the middle of the images."""
+    """[mm/px]."""
+    placement: Literal["found", "centred"] = "found"
+    """Whether the reference's holes show where the specimen is, then refined with the unknowns, or
+    its middle is the middle of the images."""
+    light_degree: int | None = 0
+    """Of the polynomials by which gain and offset of the light differ between images; None where
+    they don't."""
+    distortion: str = ""
+    """Of the lens: a file of modeharvest (JSON) or of a calibration program; images are freed from
+    it."""
     noise_sd: float | None = None
     """Of the camera, in each image [grey levels of the files]; else estimated from the images."""
     fields: tuple[str, ...] = ()
@@ -74,6 +86,10 @@ class MeasuredData:
             if (value := getattr(self, name)) is not None:
                 require_within(f"data: expected {name}", value, 0.0, above=True)
         require_within("data: expected strain_sd", self.strain_sd, 0.0, above=True)
+        if self.light_degree is not None:
+            require_within("data: expected light_degree", self.light_degree, 0, 6)
+        if self.distortion and not self.reference:
+            raise InputError("data: expected images for the distortion of a lens, got fields")
 
     @property
     def forces(self) -> Readings | None:
@@ -94,6 +110,10 @@ class TwinTruth:
     """Edge length of the elements that the data are made with [mm]."""
     travel: float = 1.0
     tilt: float = 0.0
+    values: dict[str, float] = field(default_factory=dict)
+    """Of other parameters, such as "holes.diameter[0,0]" [mm] or "right.x[2]" [mm]."""
+    imperfection: Imperfection = field(default_factory=Imperfection)
+    """Scatter of the holes, beside that."""
     force_sd: float = 0.0
     """Of the load cell; 0 for a test without forces [N/mm]."""
     force_seed: int = 0
@@ -102,10 +122,24 @@ class TwinTruth:
         require_within("twin: expected mesh_size [mm]", self.mesh_size, 0.0, above=True)
         require_within("twin: expected force_sd [N/mm]", self.force_sd, 0.0)
 
+    def every(self, experiment: Experiment) -> dict[str, float]:
+        """Values of parameters of the test by their names, the material's aside."""
+        found = {TRAVEL: self.travel, TILT: self.tilt, **self.values}
+        for k, hole in enumerate(self.imperfection.drawn(len(experiment.specimen.hole_centres))):
+            for part, off in zip(PARTS, hole, strict=True):
+                if off != 0.0:
+                    name = f"holes[{k}].{part}"
+                    found[name] = found.get(name, 0.0) + float(off)
+        return found
+
     def value(self, name: str) -> float | None:
-        """Of a parameter by its name; None if it has none of that name."""
-        if name in ("travel", "tilt"):
+        """Of a parameter by its name, holes aside; None if it has none of that name."""
+        if name in self.values:
+            return self.values[name]
+        if name in (TRAVEL, TILT):
             return float(getattr(self, name))
+        if name.startswith(("left.", "right.")):
+            return 0.0
         base, _, number = name.rstrip("]").partition("[")
         found = getattr(self.material, base, None)
         if number and isinstance(found, tuple):
@@ -135,7 +169,9 @@ class IdentificationCase(CaseModel):
     """Other materials to be identified from the same data, and compared by their evidence."""
     data: MeasuredData | None = None
     twin: Annotated[TwinTruth | None, of_kind(MATERIALS, "twin.material", "material")] = None
-    imaging: ImagingSpec = ImagingSpec()
+    imaging: Annotated[
+        ImagingSpec, of_kind({"camera": CameraDistortion}, "imaging.distortion", "distortion")
+    ] = ImagingSpec()
     finer_mesh_size: float | None = None
     """Of the mesh whose residual the last steps take [mm]; by default 0.6 of the model's."""
 
@@ -155,6 +191,8 @@ class IdentificationCase(CaseModel):
             require_within(what, self.finer_mesh_size, 0.0, most, above=True)
         if not self.unknowns:
             raise InputError("unknowns: expected at least one, got none")
+        for name in (*self.unknowns, *(self.twin.values if self.twin is not None else ())):
+            parameter(name, self.experiment)
         if (self.data is None) == (self.twin is None):
             raise InputError("expected a table [data] or a table [twin], got both or neither")
         strains = len(self.experiment.strains)

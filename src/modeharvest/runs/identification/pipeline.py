@@ -10,9 +10,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
+from modeharvest.fem.path.parameters import holes_of, parameter
 from modeharvest.idic.finite_element.identify import (
     LEVELS,
     FinerMesh,
@@ -31,34 +32,40 @@ from modeharvest.idic.finite_element.identify import (
 )
 from modeharvest.idic.finite_element.observed import (
     MOTION,
+    PLACE,
     FieldData,
     ImageData,
     StateObservation,
+    imaged,
     rigidly_moved,
-    superposed_motion,
 )
 from modeharvest.idic.finite_element.pixels import MeshPixels
-from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.field import read_field
+from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.idic.uncertainty.model_error import corrections
 from modeharvest.idic.uncertainty.parameters import compared_by_evidence
+from modeharvest.imaging.distortion.files import read_distortion
+from modeharvest.imaging.distortion.lens import undistorted
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.photograph import read_frame, read_reference
 from modeharvest.runs.case import checked
 from modeharvest.runs.identification.case import IdentificationCase, MeasuredData, TwinTruth
+from modeharvest.runs.identification.placement import found_place
 from modeharvest.runs.photographs.prepare import named_files
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, sha256_of, write_json
 from modeharvest.util.stages import StagedRun, exclusive, stage_key, versions
 from modeharvest.util.typed import to_plain
 
-_UNITS = {"exponents": "-", "travel": "-", "tilt": "rad", "amplitude": "mm",
-          "shift_x": "mm", "shift_y": "mm", "turn": "rad"}  # else MPa  # fmt: skip
+_FRAME = {"centre": (0.02, "mm"), "orientation": (0.02, "rad"),
+          "shift": (0.1, "mm"), "turn": (0.1, "rad")}  # fmt: skip
+"""How far unknowns of the camera's frame may be off where they start, lengths over the specimen's,
+and their units."""
 _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "fenics-dolfinx")
 
 
@@ -91,7 +98,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     @cached_property
     def _key(self) -> str:
-        files = [sha256_of(path) for path in self._files]
+        files = [sha256_of(path) for path in (*self._files, *self._lens)]
         return stage_key([self.case.plain(), files, self._data_key])
 
     @cached_property
@@ -108,6 +115,12 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             raise InputError(f"data: expected as many {what} as strains ({strains}), got {got}")
         return found
 
+    @property
+    def _lens(self) -> tuple[Path, ...]:
+        """The file of the lens, if there is one."""
+        data = self.case.data
+        return (self.case._base / data.distortion,) if data and data.distortion else ()
+
     def _model(self, experiment: Experiment, names: list[str]) -> Any:
         with requiring_dolfinx("identification needs"):
             from modeharvest.fem.meshing import mesh_specimen, perturb
@@ -120,16 +133,16 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         """Images of the true states, and readings of a load cell."""
         assert twin is not None
         true = replace(self.case.experiment, material=twin.material, mesh_size=twin.mesh_size)
-        model = self._model(true, ["travel", "tilt"])
-        states = model.at(np.array([twin.travel, twin.tilt]), False)
+        values = twin.every(true)
+        model = self._model(true, list(values))
+        states = model.at(np.array(list(values.values())), False)
         strains, folder = self.case.experiment.strains, self.folder / "images"
         snapshots = tuple(
             Snapshot(e, s.displacement, s.force, negative_pivots=s.negative_pivots, branch=s.branch)
             for e, s in zip(strains, states, strict=True)
         )
-        images = make_images(
-            Solution(model.mesh, snapshots, {}), self.case.imaging, folder, strains, self.progress
-        )
+        true_states = Solution(states[0].mesh, snapshots, {})
+        images = make_images(true_states, self.case.imaging, folder, strains, self.progress)
         forces = np.array([s.force for s in states])
         noise = np.random.default_rng(twin.force_seed).normal(0.0, 1.0, len(forces))
         path = self.folder / "forces.json"
@@ -137,12 +150,13 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return [*images.files, path]
 
     def _identify(self) -> list[Path]:
-        model = self._model(self.case.experiment, list(self.case.unknowns))
-        data, forces, px = self._data(model.mesh)
-        found = self._identified(self.case, model, data, forces, px)
         experiment = self.case.experiment
-        laws, comparison = self._laws(found, data, forces, px)
-        solution = Solution(model.mesh, tuple(
+        model = self._model(experiment, list(self.case.unknowns))
+        data, forces, px, frame = self._data(model.mesh)
+        found = self._identified(self.case, model, data, forces, px, frame)
+        laws, comparison = self._laws(found, data, forces, px, frame)
+        mesh = found.states[0].mesh
+        solution = Solution(mesh, tuple(
             Snapshot(s.strain, s.displacement, s.force, negative_pivots=s.negative_pivots,
                      branch=s.branch) for s in found.states
         ), {"specimen": experiment.specimen.plain()})  # fmt: skip
@@ -155,37 +169,33 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         from modeharvest.report.identification import identification_report
         from modeharvest.report.model import write_page
 
-        write_page(identification_report(summary, found, model.mesh, data), page, self.progress)
+        write_page(identification_report(summary, found, mesh, data), page, self.progress)
         write_json(path, summary)
         return [h5, vtu, page, path]
 
     def _identified(
         self, case: IdentificationCase, model: Any, data: list[StateObservation | None],
-        forces: Readings | None, px: float,
+        forces: Readings | None, px: float, frame: dict[str, Unknown],
     ) -> Identified:  # fmt: skip
-        """A case's unknowns by the data."""
-        experiment, unknowns, count = case.experiment, case.unknowns, 0
-        if self.case.data is not None and self.case.data.rigid_motion:
-            count = len(experiment.strains)
-        length = float(np.ptp(model.mesh.nodes[:, 0]))
-        bounds = {"shift_x": 0.1 * length, "shift_y": 0.1 * length, "turn": 0.1}
-        frame = {f"{name}[{k}]": Unknown(0.0, (-bounds[name], bounds[name]))
-                 for k in range(count) for name in MOTION}  # fmt: skip
+        """A case's unknowns, and the camera's, by the data."""
+        experiment, unknowns = case.experiment, case.unknowns
+        size = self.case.finer_mesh_size or 0.6 * experiment.mesh_size
+        fine = self._model(replace(experiment, mesh_size=size), list(unknowns))
+        has_place = any(name in PLACE for name in frame)
 
-        def states(values: FloatArray) -> list[Any]:
-            own, motions = np.split(values, [len(unknowns)])
-            found = model.at(own)
-            return [
-                rigidly_moved(state, model.mesh.nodes, motion, k, count)
-                for k, (state, motion) in enumerate(zip(found, motions.reshape(-1, 3), strict=True))
-            ] if count else found  # fmt: skip
+        def seen(model: Any, values: FloatArray, with_derivatives: bool) -> list[Any]:
+            own, place, motions = np.split(values, [len(unknowns), len(unknowns) + 3 * has_place])
+            states = model.at(own, with_derivatives)
+            motions = motions.reshape(-1, 3)
+            return [imaged(state, place if has_place else None, motions, k)
+                    for k, state in enumerate(states)]  # fmt: skip
 
         strain_sd = 1e-5 if self.case.data is None else self.case.data.strain_sd
         return identify(
-            states, data, unknowns | frame, pixel_size=px, forces=forces,
-            levels=(*[Level(4, 3.0)] * (count > 0), *LEVELS),
+            lambda values: seen(model, values, True), data, unknowns | frame, pixel_size=px,
+            forces=forces, levels=(*[Level(4, 3.0)] * (f"{MOTION[0]}[0]" in frame), *LEVELS),
             strains=Readings(np.array(experiment.strains), strain_sd),
-            finer=self._finer(experiment, list(unknowns), model.mesh),
+            finer=FinerMesh(lambda values: seen(fine, values, False), size / experiment.mesh_size),
             corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
             progress=self.progress,
         )  # fmt: skip
@@ -213,67 +223,114 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             for (name, result), (log, by_mesh) in zip(results.items(), evidence, strict=True)
         ], [text]  # fmt: skip
 
-    def _finer(self, experiment: Experiment, names: list[str], mesh: Mesh) -> FinerMesh:
-        """The states on a finer mesh, at this mesh's nodes."""
-        size = self.case.finer_mesh_size or 0.6 * experiment.mesh_size
-        model = self._model(replace(experiment, mesh_size=size), names)
-
-        def states(values: FloatArray) -> list[tuple[FloatArray, float]]:
-            own, motions = np.split(values, [len(names)])
-            found = [
-                (nodal_values(model.mesh, state.displacement, mesh.nodes, beside=True), state.force)
-                for state in model.at(own, False)
-            ]
-            for k, motion in enumerate(motions.reshape(-1, 3)):
-                found[k] = superposed_motion(found[k][0], mesh.nodes, motion)[0], found[k][1]
-            return found
-
-        return FinerMesh(states, size / experiment.mesh_size)
-
-    def _data(self, mesh: Any) -> tuple[list[StateObservation | None], Readings | None, float]:
-        """Of each state, with the forces, and the size of a pixel [mm]."""
+    def _data(
+        self, mesh: Mesh
+    ) -> tuple[list[StateObservation | None], Readings | None, float, dict[str, Unknown]]:
+        """Of each state, with the forces, the size of a pixel [mm], and the camera's unknowns."""
         twin, data = self.case.twin, self.case.data
         if twin is not None:
-            images, pixels = ImageSet.read(self.folder / "images"), MeshPixels(mesh)
-            f, mask = images.reference(camera=True), images.mask()
-            states = []
-            for e in images.strains:
-                g = images.deformed(e, camera=True)
-                at = ((None, mask), (e, images.deformed_mask(e)))
-                sds = [float(images.noise_sd(which)[where].mean()) for which, where in at]
-                pair = ImagePair(f, g, images.grid)
-                states.append(ImageData(pair, pixels, ImageNoise(*sds)))
             readings = np.array(read_json(self.folder / "forces.json")["forces_N_per_mm"])
             forces = Readings(readings, twin.force_sd) if twin.force_sd > 0.0 else None
-            return [*states], forces, images.grid.pixel_size
+            images = ImageSet.read(self.folder / "images")
+            return [*self._exposed(images, mesh)], forces, images.grid.pixel_size, {}
         assert data is not None
+        count = len(self.case.experiment.strains) if data.rigid_motion else 0
+        start = {f"{name}[{k}]": 0.0 for k in range(count) for name in MOTION}
         if data.fields:
             assert data.field_sd_mm is not None
             fields = [read_field(path, y_axis=data.y_axis) for path in self._files]
-            measured = [
+            found: list[Any] = [
                 FieldData(f.points[f.good], f.u[f.good], data.field_sd_mm, mesh) for f in fields
             ]
-            return [*measured], data.forces, data.field_sd_mm
-        return [*self._photographed(data, MeshPixels(mesh))], data.forces, data.pixel_size or 1.0
+            px = data.field_sd_mm
+        else:
+            pairs, place = self._photographed(data)
+            if place is not None:
+                start = dict(zip(PLACE, place, strict=True)) | start
+                none = np.zeros((0, *mesh.nodes.shape))
+                mesh = replace(mesh, nodes=rigidly_moved(mesh.nodes, none, place)[0])
+            noise = None if data.noise_sd is None else ImageNoise.of(data.noise_sd)
+            pixels, degree = MeshPixels(mesh), data.light_degree
+            light = None if degree is None else partial(alike, degree=degree)
+            found = [ImageData(pair, pixels, noise, light) for pair in pairs]
+            px = pairs[0].grid.pixel_size
+        length, frame = float(np.ptp(mesh.nodes[:, 0])), dict[str, Unknown]()
+        for name, value in start.items():
+            share, unit = _FRAME[re.split(r"[_[]", name)[0]]
+            reach = share * (length if unit == "mm" else 1.0)
+            frame[name] = Unknown(value, (value - reach, value + reach))
+        return found, data.forces, px, frame
 
-    def _photographed(self, data: MeasuredData, pixels: MeshPixels) -> list[ImageData]:
-        """The images of the files."""
+    def _exposed(self, images: ImageSet, mesh: Mesh) -> Iterator[ImageData]:
+        """The images of a twin, freed from what its lens is known to do."""
+        lens = self.case.imaging.lens(images.grid.shape)
+        light = partial(alike, degree=0) if self.case.imaging.sensor.flicker else None
+        pixels = MeshPixels(mesh)
+
+        def image(strain: float | None) -> FloatImage:
+            own = (
+                images.reference(camera=True)
+                if strain is None
+                else images.deformed(strain, camera=True)
+            )
+            return own if lens is None else undistorted(own, lens)
+
+        for e in images.strains:
+            at = ((None, images.mask()), (e, images.deformed_mask(e)))
+            sds = [float(images.noise_sd(which)[where].mean()) for which, where in at]
+            pair = ImagePair(image(None), image(e), images.grid)
+            yield ImageData(pair, pixels, ImageNoise(*sds), light)
+
+    def _photographed(self, data: MeasuredData) -> tuple[list[ImagePair], FloatArray | None]:
+        """The images of the files, and where the reference shows the specimen."""
         reference = read_reference(self._files[0])
+        frames = [reference.image, *(read_frame(path, reference).image for path in self._files[1:])]
+        for path in self._lens:
+            lens = read_distortion(path)
+            frames = [undistorted(frame, lens) for frame in frames]
+        (first, *others), specimen = frames, self.case.experiment.specimen
         grid = PixelGrid.centred(*reference.shape, data.pixel_size or 1.0)
-        noise = None if data.noise_sd is None else ImageNoise.of(data.noise_sd)
-        frames = (read_frame(path, reference).image for path in self._files[1:])
-        pairs = (ImagePair(reference.image, image, grid) for image in frames)
-        return [ImageData(pair, pixels, noise) for pair in pairs]
+        place = None if data.placement == "centred" else found_place(first, grid, specimen)
+        return [ImagePair(first, other, grid) for other in others], place
+
+    def _holes(self, found: Identified) -> tuple[list[dict[str, Any]] | None, dict[str, Any]]:
+        """The holes as found, if they are unknown; and true values of a twin's unknowns."""
+        experiment, twin = self.case.experiment, self.case.twin
+        true = {} if twin is None else {name: twin.value(name) for name in found.unknowns}
+        chosen = [k for k, name in enumerate(found.unknowns) if name.startswith("holes")]
+        if not chosen:
+            return None, true
+        names = [list(found.unknowns)[k] for k in chosen]
+        design = np.array([holes_of([name], [1.0], experiment).ravel() for name in names]).T
+        off = (design @ found.values[chosen]).reshape(-1, 3)
+        covariance = found.covariance_with_model_error[np.ix_(chosen, chosen)]
+        sd = np.sqrt(np.einsum("ij,jk,ik->i", design, covariance, design)).reshape(-1, 3)
+        exact = None
+        if twin is not None:
+            own = twin.every(experiment)
+            exact = holes_of(list(own), list(own.values()), experiment)
+            true |= dict(zip(names, np.linalg.lstsq(design, exact.ravel())[0], strict=True))
+        spec = experiment.specimen
+        return [
+            {"centre": spec.hole_centres[k], "diameter": spec.diameters[k], "off": off[k],
+             "off_sd": sd[k], "true": None if exact is None else exact[k]}
+            for k in range(len(off))
+        ], true  # fmt: skip
+
+    def _unit(self, name: str) -> str:
+        """Of an unknown."""
+        frame = _FRAME.get(re.split(r"[_[]", name)[0])
+        return parameter(name, self.case.experiment).unit if frame is None else frame[1]
 
     def _summary(self, found: Identified, model: Any) -> dict[str, Any]:
-        case, twin, forces = self.case, self.case.twin, found.forces
+        case, forces, (holes, true) = self.case, found.forces, self._holes(found)
         rows = zip(found.unknowns, found.unknowns.values(), found.values, found.sd,
                    found.sd_with_model_error, found.mesh_error, strict=True)  # fmt: skip
         parameters = [
-            {"name": name, "unit": _UNITS.get(re.sub(r"\[.*", "", name), "MPa"),
+            {"name": name, "unit": self._unit(name),
              "start": unknown.start, "bounds": unknown.bounds, "value": value, "sd": sd,
              "sd_with_model_error": sd_model, "mesh_error": off,
-             "true": None if twin is None else twin.value(name)}
+             "true": true.get(name)}
             for name, unknown, value, sd, sd_model, off in rows
         ]  # fmt: skip
         readings: FloatArray = (
@@ -296,6 +353,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "explanation": found.minimum.outcome.explanation,
             "critical_strain": model.critical_strain,
             "states": states,
+            "holes": holes,
             "force_sd_N_per_mm": None if forces is None else forces.sd,
             "evaluations": found.evaluations,
             "model_unknowns": model.unknowns,
