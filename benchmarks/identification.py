@@ -6,7 +6,9 @@ A small specimen is simulated with known parameters and photographed once withou
 adds noise to images and forces and identifies from values off by a factor of two. ``--mesh`` is the
 model's mesh, ``--twin-mesh`` that of the data: with one mesh for both what is seen is statistics
 alone. ``--fields`` instead identifies exact displacements and forces of a model of 0.1 mm elements
-by coarser ones: the error by the mesh.
+by coarser ones: the error by the mesh. ``--holes`` instead identifies a specimen whose holes are
+2 % larger than the model's and scattered, with its holes ignored, all as large as they are on
+average, or each by itself; data and model have meshes of their own.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +24,15 @@ import numpy as np
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.path.parameters import PARTS, holes_of
 from modeharvest.fem.path.parametric import ParametricTest
-from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.finite_element.identify import Readings, Unknown, identify
+from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.idic.finite_element.identify import FinerMesh, Readings, Unknown, identify
 from modeharvest.idic.finite_element.observed import FieldData, ImageData
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.idic.uncertainty.model_error import corrections
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
@@ -51,9 +56,12 @@ def main() -> None:
     parser.add_argument("--twin-mesh", type=float, default=0.35, help="[mm]")
     parser.add_argument("--pixel-size", type=float, default=0.04, help="[mm/px]")
     parser.add_argument("--fields", action="store_true")
+    parser.add_argument("--holes", action="store_true")
     how = parser.parse_args()
     if how.fields:
         by_mesh()
+    elif how.holes:
+        by_holes(how.seeds)
     else:
         by_seed(how)
 
@@ -81,6 +89,70 @@ def by_mesh() -> None:
         found = identify(model.at, data, UNKNOWNS, pixel_size=0.03, forces=forces)
         row = (f"{v:.4g}" for v in (*found.values[:3], 1e3 * found.state_equations[-1].residual))
         print("|", size, "|", " | ".join(row), "|", flush=True)
+
+
+HOLES = {"holes.diameter[0,0]": 0.03}
+SCATTER = Imperfection(0.006, 0.006, seed=1)
+
+
+def by_holes(seeds: int) -> None:
+    """Print what is found where holes are ignored, alike, or each by itself."""
+
+    def model(size: float, names: list[str]) -> ParametricTest:
+        experiment = Experiment(SPECIMEN, strains=STRAINS, mesh_size=size)
+        return ParametricTest(experiment, names, mesh_specimen(SPECIMEN, size))
+
+    count = len(SPECIMEN.hole_centres)
+    own = [f"holes[{k}].{part}" for k in range(count) for part in PARTS]
+    off = SCATTER.drawn(count)
+    truth = {"tilt": 0.01, **HOLES, **dict(zip(own, off.ravel(), strict=True))}
+    states = model(0.15, list(truth)).at(np.array(list(truth.values())), False)
+    exact = off + np.array([0.0, 0.0, *HOLES.values()])
+    forces = np.array([s.force for s in states])
+    sd = FORCE_NOISE * float(forces.max())
+    snapshots = tuple(Snapshot(e, s.displacement) for e, s in zip(STRAINS, states, strict=True))
+    sets = {"ignored": [], "alike": list(HOLES), "each": own}
+    print("| holes | modulus | kappa | tilt | errors of x, y, diameter, rms [um] | predicted | "
+          "residual over noise | p | s |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        spec = ImagingSpec(pixel_size=0.03, margin_px=12)
+        solution = Solution(states[0].mesh, snapshots, {})
+        images = make_images(solution, spec, Path(folder), STRAINS)
+        clear = [images.reference(), *(images.deformed(e) for e in STRAINS)]
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            f, *others = (i + rng.normal(0.0, NOISE, i.shape) for i in clear)
+            readings = Readings(forces + rng.normal(0.0, sd, len(forces)), sd)
+            for name, holes in sets.items():
+                names = ["moduli[0]", "kappa", "tilt", *holes]
+                coarse, fine = model(0.35, names), model(0.22, names)
+                pixels, noise = MeshPixels(coarse.mesh), ImageNoise(NOISE, NOISE)
+                data = [ImageData(ImagePair(f, g, images.grid), pixels, noise) for g in others]
+                unknowns = {n: UNKNOWNS.get(n, Unknown(0.0, (-0.08, 0.08))) for n in names}
+                begin = time.process_time()
+                found = identify(
+                    coarse.at, data, unknowns, pixel_size=0.03, forces=readings,
+                    finer=FinerMesh(partial(fine.at, with_derivatives=False), 0.22 / 0.35),
+                    corrections=corrections(coarse.mesh.nodes, SPECIMEN.vectors),
+                )  # fmt: skip
+                seconds = time.process_time() - begin
+                error = holes_of(names, found.values, coarse.experiment) - exact
+                predicted = found.sd_with_model_error[3:].reshape(-1, 3 if holes == own else 1)
+                ratio = max(s.residual / s.expected for s in found.state_equations)
+                row = [f"{v:.4g} ± {s:.2g}" for v, s in
+                       zip(found.values[:3], found.sd_with_model_error, strict=False)]  # fmt: skip
+                for part in (error, predicted):
+                    rms = 1e3 * np.sqrt(np.mean(part**2, axis=0)) if part.size else []
+                    row.append(", ".join(f"{v:.1f}" for v in rms))
+                test = found.model_error
+                p = "" if test is None else f"{test.p_value:.2g}"
+                row += [f"{ratio:.3f}", p, f"{seconds:.0f}"]
+                print("|", name, "|", " | ".join(row), "|", flush=True)
+                if holes == own:
+                    z = error / predicted
+                    within = 100 * np.mean(abs(z) < 1.96)
+                    print(f"{within:.0f} % of {z.size} within 95 %; rms {z.std():.2f}", flush=True)
 
 
 def by_seed(how: argparse.Namespace) -> None:

@@ -37,6 +37,7 @@ from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.idic.uncertainty.model_error import corrections
+from modeharvest.idic.uncertainty.parameters import undetermined_combinations
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
@@ -234,6 +235,15 @@ def test_statements_name_what_the_data_do_not_determine() -> None:
     tight = {**UNKNOWNS, "b": Unknown(-0.3, (-0.5, 0.0))}
     stopped = identify(model, images(0), tight, pixel_size=0.04, forces=FORCES)
     assert stopped.statements[0].startswith("b is at its bound: the data may want it beyond [-0.5,")
+
+
+def test_a_combination_of_many_parameters_has_words_too() -> None:
+    """Holes all alike, and each by itself: 17 components of a unit vector, none of them large."""
+    names = ["all", *(f"hole {k}" for k in range(16))]
+    design = np.hstack([np.ones((16, 1)), np.eye(16)])
+    (text,) = undetermined_combinations(names, 1e6 * design.T @ design, [1.0] * 17)
+    assert text.startswith("all and hole 0 and hole 1 and")
+    assert text.endswith("together (nothing determines it)")
 
 
 def test_a_wrong_model_widens_the_intervals() -> None:

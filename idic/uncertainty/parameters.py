@@ -11,7 +11,7 @@ from modeharvest.util.arrays import FloatArray
 _LARGE = 0.2
 """Relative standard deviation of a combination of parameters beyond which words say so."""
 _PART = 0.3
-"""Of a unit eigenvector: which parameters a combination is of."""
+"""Of an eigenvector's largest component: which parameters a combination is of."""
 
 
 def undetermined_combinations(
@@ -30,7 +30,7 @@ def undetermined_combinations(
     for size, vector in zip(sizes, vectors.T, strict=True):
         if size < _LARGE:
             continue
-        own = [k for k in np.argsort(-abs(vector)) if abs(vector[k]) > _PART]
+        own = [k for k in np.argsort(-abs(vector)) if abs(vector[k]) > _PART * max(abs(vector))]
         vector = vector * np.sign(vector[own[0]])
         how = "nothing determines it" if size > 1e3 else f"known to {100 * size:.2g} %"
         if len(own) == 1:

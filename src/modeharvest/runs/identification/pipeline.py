@@ -304,11 +304,13 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         design = np.array([holes_of([name], [1.0], experiment).ravel() for name in names]).T
         off = (design @ found.values[chosen]).reshape(-1, 3)
         covariance = found.covariance_with_model_error[np.ix_(chosen, chosen)]
-        sd = np.sqrt(np.einsum("ij,jk,ik->i", design, covariance, design)).reshape(-1, 3)
+        own = np.nan_to_num(covariance, posinf=1e6)  # of what nothing determines
+        variance = np.einsum("ij,jk,ik->i", design, own, design)
+        sd = np.hypot(np.sqrt(variance), design @ found.mesh_error[chosen]).reshape(-1, 3)
         exact = None
         if twin is not None:
-            own = twin.every(experiment)
-            exact = holes_of(list(own), list(own.values()), experiment)
+            values = twin.every(experiment)
+            exact = holes_of(list(values), list(values.values()), experiment)
             true |= dict(zip(names, np.linalg.lstsq(design, exact.ravel())[0], strict=True))
         spec = experiment.specimen
         return [
