@@ -6,9 +6,10 @@ A small specimen is simulated with known parameters and photographed once withou
 adds noise to images and forces and identifies from values off by a factor of two. ``--mesh`` is the
 model's mesh, ``--twin-mesh`` that of the data: with one mesh for both what is seen is statistics
 alone. ``--fields`` instead identifies exact displacements and forces of a model of 0.1 mm elements
-by coarser ones: the error by the mesh. ``--holes`` instead identifies a specimen whose holes are
-2 % larger than the model's and scattered, with its holes ignored, all as large as they are on
-average, or each by itself; data and model have meshes of their own.
+by coarser ones: the error by the mesh. ``--unknown holes`` instead identifies a specimen whose
+holes are 2 % larger than the model's and scattered, with its holes ignored, all as large as they
+are on average, or each by itself; ``--unknown edges`` one whose loaded edges bow, slide and spread,
+ignored or unknown; data and model have meshes of their own.
 """
 
 from __future__ import annotations
@@ -56,12 +57,12 @@ def main() -> None:
     parser.add_argument("--twin-mesh", type=float, default=0.35, help="[mm]")
     parser.add_argument("--pixel-size", type=float, default=0.04, help="[mm/px]")
     parser.add_argument("--fields", action="store_true")
-    parser.add_argument("--holes", action="store_true")
+    parser.add_argument("--unknown", choices=list(SETS))
     how = parser.parse_args()
     if how.fields:
         by_mesh()
-    elif how.holes:
-        by_holes(how.seeds)
+    elif how.unknown:
+        by_unknowns(how.unknown, how.seeds)
     else:
         by_seed(how)
 
@@ -91,30 +92,37 @@ def by_mesh() -> None:
         print("|", size, "|", " | ".join(row), "|", flush=True)
 
 
-HOLES = {"holes.diameter[0,0]": 0.03}
 SCATTER = Imperfection(0.006, 0.006, seed=1)
+OWN = [f"holes[{k}].{part}" for k in range(len(SPECIMEN.hole_centres)) for part in PARTS]
+TRUTHS = {
+    "holes": {"holes.diameter[0,0]": 0.03,
+              **dict(zip(OWN, SCATTER.drawn(len(OWN) // 3).ravel(), strict=True))},
+    "edges": {"right.x[2]": 0.1, "right.y[0]": 0.1, "left.y[1]": -0.1},
+}  # fmt: skip
+SETS = {
+    "holes": {"ignored": [], "alike": ["holes.diameter[0,0]"], "each": OWN},
+    "edges": {"ignored": [], "each": list(TRUTHS["edges"])},
+}
+"""True values [mm], and which parameters are unknown."""
 
 
-def by_holes(seeds: int) -> None:
-    """Print what is found where holes are ignored, alike, or each by itself."""
+def by_unknowns(what: str, seeds: int) -> None:
+    """Print what is found where holes or edges are ignored or unknown."""
 
     def model(size: float, names: list[str]) -> ParametricTest:
         experiment = Experiment(SPECIMEN, strains=STRAINS, mesh_size=size)
         return ParametricTest(experiment, names, mesh_specimen(SPECIMEN, size))
 
-    count = len(SPECIMEN.hole_centres)
-    own = [f"holes[{k}].{part}" for k in range(count) for part in PARTS]
-    off = SCATTER.drawn(count)
-    truth = {"tilt": 0.01, **HOLES, **dict(zip(own, off.ravel(), strict=True))}
-    states = model(0.15, list(truth)).at(np.array(list(truth.values())), False)
-    exact = off + np.array([0.0, 0.0, *HOLES.values()])
+    truth = {"tilt": 0.01, **TRUTHS[what]}
+    finest = model(0.15, list(truth))
+    states = finest.at(np.array(list(truth.values())), False)
+    holes = holes_of(list(truth), list(truth.values()), finest.experiment)
     forces = np.array([s.force for s in states])
     sd = FORCE_NOISE * float(forces.max())
     snapshots = tuple(Snapshot(e, s.displacement) for e, s in zip(STRAINS, states, strict=True))
-    sets = {"ignored": [], "alike": list(HOLES), "each": own}
-    print("| holes | modulus | kappa | tilt | errors of x, y, diameter, rms [um] | predicted | "
-          "residual over noise | p | s |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("| seed |", what, "| modulus | kappa | tilt | errors [um] | predicted [um] | within 95 % "
+          "| residual over noise | p | processor [s] |")  # fmt: skip
+    print("|" + 11 * "---|")
     with tempfile.TemporaryDirectory() as folder:
         spec = ImagingSpec(pixel_size=0.03, margin_px=12)
         solution = Solution(states[0].mesh, snapshots, {})
@@ -124,12 +132,13 @@ def by_holes(seeds: int) -> None:
             rng = np.random.default_rng(seed)
             f, *others = (i + rng.normal(0.0, NOISE, i.shape) for i in clear)
             readings = Readings(forces + rng.normal(0.0, sd, len(forces)), sd)
-            for name, holes in sets.items():
-                names = ["moduli[0]", "kappa", "tilt", *holes]
+            for name, unknown in SETS[what].items():
+                names = ["moduli[0]", "kappa", "tilt", *unknown]
                 coarse, fine = model(0.35, names), model(0.22, names)
                 pixels, noise = MeshPixels(coarse.mesh), ImageNoise(NOISE, NOISE)
                 data = [ImageData(ImagePair(f, g, images.grid), pixels, noise) for g in others]
-                unknowns = {n: UNKNOWNS.get(n, Unknown(0.0, (-0.08, 0.08))) for n in names}
+                reach = 0.08 if what == "holes" else 0.5
+                unknowns = {n: UNKNOWNS.get(n, Unknown(0.0, (-reach, reach))) for n in names}
                 begin = time.process_time()
                 found = identify(
                     coarse.at, data, unknowns, pixel_size=0.03, forces=readings,
@@ -137,22 +146,28 @@ def by_holes(seeds: int) -> None:
                     corrections=corrections(coarse.mesh.nodes, SPECIMEN.vectors),
                 )  # fmt: skip
                 seconds = time.process_time() - begin
-                error = holes_of(names, found.values, coarse.experiment) - exact
-                predicted = found.sd_with_model_error[3:].reshape(-1, 3 if holes == own else 1)
-                ratio = max(s.residual / s.expected for s in found.state_equations)
-                row = [f"{v:.4g} ± {s:.2g}" for v, s in
-                       zip(found.values[:3], found.sd_with_model_error, strict=False)]  # fmt: skip
-                for part in (error, predicted):
-                    rms = 1e3 * np.sqrt(np.mean(part**2, axis=0)) if part.size else []
-                    row.append(", ".join(f"{v:.1f}" for v in rms))
+                predicted = found.sd_with_model_error
+                if what == "holes":  # x, y and diameter of all, rms
+                    error = holes_of(names, found.values, coarse.experiment) - holes
+                    own = predicted[3:].reshape(-1, 3 if unknown == OWN else 1)
+                    sizes, own_sizes = (
+                        np.sqrt(np.mean(e**2, axis=0)) if e.size else e[0:0, 0]
+                        for e in (error, own)
+                    )
+                else:
+                    error = sizes = found.values[3:] - np.array([truth[n] for n in unknown])
+                    own = own_sizes = predicted[3:]
+                z = error / own if own.shape == error.shape else np.zeros(0)
                 test = found.model_error
-                p = "" if test is None else f"{test.p_value:.2g}"
-                row += [f"{ratio:.3f}", p, f"{seconds:.0f}"]
-                print("|", name, "|", " | ".join(row), "|", flush=True)
-                if holes == own:
-                    z = error / predicted
-                    within = 100 * np.mean(abs(z) < 1.96)
-                    print(f"{within:.0f} % of {z.size} within 95 %; rms {z.std():.2f}", flush=True)
+                row = [
+                    *(f"{found.values[k]:.4g} ± {predicted[k]:.2g}" for k in range(3)),
+                    *(", ".join(f"{1e3 * v:.1f}" for v in part) for part in (sizes, own_sizes)),
+                    f"{(abs(z) < 1.96).sum()} of {z.size}",
+                    f"{max(s.residual / s.expected for s in found.state_equations):.3f}",
+                    "" if test is None else f"{test.p_value:.2g}",
+                    f"{seconds:.0f}",
+                ]  # fmt: skip
+                print("|", seed, "|", name, "|", " | ".join(row), "|", flush=True)
 
 
 def by_seed(how: argparse.Namespace) -> None:

@@ -179,7 +179,7 @@ def test_photographs_off_the_middle_of_another_light_and_through_a_lens(tmp_path
 
 @pytest.mark.dolfinx
 def test_larger_holes_and_a_bowed_edge_are_found(tmp_path: Path) -> None:
-    """On a mesh that isn't the data's, of a specimen whose holes are scattered, too."""
+    """Under a light that changes, through a known lens; the holes are scattered, too."""
     unknowns = {"moduli[0]": {"start": 2.4, "bounds": [0.1, 10.0]},
                 "kappa": {"start": 2.7, "bounds": [0.5, 50.0]},
                 "holes.diameter[0,0]": {"start": 0.0, "bounds": [-0.1, 0.1]},
@@ -188,7 +188,11 @@ def test_larger_holes_and_a_bowed_edge_are_found(tmp_path: Path) -> None:
     twin = {"mesh_size": 0.5, "force_sd": 0.002, "force_seed": 3,
             "values": {"holes.diameter[0,0]": 0.04, "holes[1].y": 0.02, "right.x[2]": 0.3},
             "imperfection": {"position_sd": 1e-4, "diameter_sd": 1e-4}}  # fmt: skip
-    summary = run_identification(BEFORE | {"unknowns": unknowns, "twin": twin}, tmp_path)
+    sensor = {"read_noise": 0.01, "read_seed": 5, "flicker": 0.05, "flicker_seed": 2}
+    lens = {"kind": "camera", "fx": 900, "fy": 900, "cx": 108, "cy": 58, "k1": 0.2}
+    imaging = {"pixel_size": 0.05, "margin_px": 14, "sensor": sensor, "distortion": lens}
+    tables = BEFORE | {"unknowns": unknowns, "twin": twin, "imaging": imaging}
+    summary = run_identification(tables, tmp_path)
     assert summary["outcome"] == "converged"
     require_truth(summary)
     true = {p["name"]: p["true"] for p in summary["parameters"]}

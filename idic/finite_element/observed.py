@@ -159,7 +159,7 @@ class ImageData:
         x, y = S[..., 0], S[..., 1]
         left = np.einsum("mab,kmb->kma", xx, x) + np.einsum("mab,kmb->kma", xy, y)
         right = np.einsum("mba,kmb->kma", xy, x) + np.einsum("mab,kmb->kma", yy, y)
-        matrix = np.einsum("jma,kma->jk", x, left) + np.einsum("jma,kma->jk", y, right)
+        matrix = np.tensordot(x, left, ([1, 2],) * 2) + np.tensordot(y, right, ([1, 2],) * 2)
         w = self._weight
         return StateEquations(
             w * blocks, w * 0.5 * (matrix + matrix.T), w * nodal.square_sum, nodal.pixels,

@@ -19,7 +19,7 @@ def identify(
     ],
     out: OutFolder,
 ) -> None:
-    """Identify material constants and boundary motion from images and forces (needs dolfinx).
+    """Identify material, supports and holes of a test from images and forces (needs dolfinx).
 
     Integrated digital image correlation with a finite-element model's parameters as unknowns; the
     images may be replaced by a displacement field of any code. Leaves the parameters with standard
