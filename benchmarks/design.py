@@ -10,7 +10,11 @@ does is how far v1 is off without noise, beside the best fit.
 With --strains the test is simulated at four strains beyond buckling, and the errors by these states
 are set against those that the design has from the last one by the root law of a pitchfork.
 
-Run: scripts/env python benchmarks/design.py [--seeds 30] [--json FILE] [--strains]
+With --parameters the material and the tilt of a small specimen, of the benchmark of identification,
+are identified from images and forces under draws of the noise at three setups, by the model that
+the data are of: scatter and reported standard deviations over the design's.
+
+Run: scripts/env python benchmarks/design.py [--seeds 30] [--json FILE] [--strains | --parameters]
 """
 
 from __future__ import annotations
@@ -29,12 +33,13 @@ from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.result import Result
-from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.setup import CorrelationOptions, SquareLatticeOptions
 from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.idic.uncertainty.covariance import propagated_sd
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.validation.design import WANTED, Design, DesignOptions, DesignSetup
 
@@ -152,12 +157,77 @@ def other_strains(case: Case) -> None:
         print(f"| {100 * strain:g} | {errors.w_px:.2f} | " + " | ".join(ratios) + " |", flush=True)
 
 
+PARAMETER_SETUPS = {
+    "0.05 mm/px, 1 % of read noise": (0.003, {"pixel_size": 0.05, "noise": 0.01}),
+    "0.04 mm/px, 3 %, speckle 0.7 times as wide": (
+        0.003, {"pixel_size": 0.04, "noise": 0.03, "speckle_width": 0.7},
+    ),
+    "0.05 mm/px, 2 %, 4 exposures, load cell 0.01 N/mm": (
+        0.01, {"pixel_size": 0.05, "noise": 0.02, "exposures": 4},
+    ),
+}  # fmt: skip
+"""Noise of the load cell [N/mm], and what differs from the defaults."""
+
+
+def of_parameters(seeds: int) -> None:
+    """Print scatter and reported standard deviations of a model's parameters over the design's."""
+    from identification_statistics import SPECIMEN, STRAINS, TRUE, UNKNOWNS, made
+
+    from modeharvest.idic.finite_element.identify import Readings, Unknown, identify
+    from modeharvest.idic.finite_element.observed import ImageData
+    from modeharvest.idic.finite_element.pixels import MeshPixels
+    from modeharvest.idic.solver.noise import ImageNoise
+    from modeharvest.validation.design_parameters import ModelStates
+
+    test, true, names = made(0.4), np.array(list(TRUE.values())), tuple(TRUE)
+    states, pixels = test.at(true), MeshPixels(test.mesh)
+    unknowns = {n: Unknown(v, UNKNOWNS[n].bounds) for n, v in zip(names, true, strict=True)}
+    snapshots = tuple(Snapshot(e, s.displacement) for e, s in zip(STRAINS, states, strict=True))
+    forces = np.array([s.force for s in states])
+    heads = [f"{name}, {what}" for name in names for what in ("predicted", "scatter", "reported")]
+    print("| setup | " + " | ".join(heads) + " |\n" + "|---" * (1 + len(heads)) + "|")
+    for kind, (force_sd, changed) in PARAMETER_SETUPS.items():
+        imaging = ImagingSpec(pixel_size=changed["pixel_size"], margin_px=12, bits=16)
+        how = replace(SquareLatticeOptions(), edge_px=2)
+        model = ModelStates(names, true, dict(zip(STRAINS, states, strict=True)), STRAINS, force_sd)
+        options = DesignOptions(pattern=0.3, parameters=names, force_sd=force_sd)
+        design = Design(SPECIMEN, imaging, how, options, STRAINS[-1], None, model)
+        setup = replace(design.setup, **changed)  # type: ignore[arg-type]
+        predicted, noise = design.parameter_sd(setup), design.image_noise(setup)
+        imaging = replace(imaging, speckle=design.speckle(setup)[0])
+        with tempfile.TemporaryDirectory() as folder:
+            solution = Solution(test.mesh, snapshots, {})
+            images = make_images(solution, imaging, Path(folder), STRAINS)
+            exact = images.reference(), *(images.deformed(e) for e in STRAINS)
+        found, sds = [], []
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            f, *deformed = (i + rng.normal(0.0, noise, i.shape) for i in exact)
+            data = [
+                ImageData(ImagePair(f, g, images.grid), pixels, ImageNoise(noise, noise))
+                for g in deformed
+            ]
+            readings = Readings(forces + rng.normal(0.0, force_sd, len(forces)), force_sd)
+            given = {"pixel_size": setup.pixel_size, "forces": readings, "levels": (FULL,)}
+            result = identify(test.near, data, unknowns, **given)  # type: ignore[arg-type]
+            found.append(result.values)
+            sds.append(result.sd)
+        scatter, reported = np.std(found, axis=0, ddof=1), np.mean(sds, axis=0)
+        cells = zip(predicted, scatter / predicted, reported / predicted, strict=True)
+        text = (f"{p:.3g} | {s:.2f} | {r:.2f}" for p, s, r in cells)
+        print(f"| {kind} | " + " | ".join(text) + " |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--seeds", type=int, default=30, help="draws of the noise")
     parser.add_argument("--json", type=Path, help="where to leave all numbers")
     parser.add_argument("--strains", action="store_true", help="the root law instead")
+    parser.add_argument("--parameters", action="store_true", help="of a model, instead")
     options = parser.parse_args()
+    if options.parameters:
+        of_parameters(options.seeds)
+        return
     case, path = Case.read("paper-virtual"), shipped_solution("paper-virtual")
     if options.strains:
         other_strains(case)

@@ -142,7 +142,7 @@ def by_unknowns(what: str, seeds: int) -> None:
                 begin = time.process_time()
                 found = identify(
                     coarse.at, data, unknowns, pixel_size=0.03, forces=readings,
-                    finer=FinerMesh(partial(fine.at, with_derivatives=False), 0.22 / 0.35),
+                    finer=FinerMesh(partial(fine.at, with_derivatives=False), (0.22 / 0.35) ** 2),
                     corrections=corrections(coarse.mesh.nodes, SPECIMEN.vectors),
                 )  # fmt: skip
                 seconds = time.process_time() - begin

@@ -1,11 +1,13 @@
 """The weak form of a hyperelastic body: what dolfinx assembles, for specimens and cells alike.
 
 Total Lagrangian, plane strain, six-node triangles with the three-point Gauss rule, as in the
-paper's section "Virtual Experiments". A material states its energy; the rest is derived.
+paper's section "Virtual Experiments"; or polynomials of a higher degree on them, with a rule to
+match. A material states its energy; the rest is derived.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from typing import Any
 
@@ -21,7 +23,6 @@ from modeharvest.fem.materials import Material
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
-_THREE_POINTS = {"quadrature_degree": 2}  # on a triangle: the three-point Gauss rule
 _CORNERS_AND_MIDDLES = 0.5 * np.array([[0, 0], [2, 0], [0, 2], [1, 1], [0, 1], [1, 0]])
 
 
@@ -34,22 +35,25 @@ class Hyperelastic:
 
     parametric : whether ``constants`` has the material's as dolfinx Constants by their names, such
         as "kappa" or "moduli[0]"; otherwise the forms are compiled with their values, and faster.
+    degree : of the displacement's polynomials over an element.
     """
 
     def __init__(
-        self, mesh: Mesh, material: Material, comm: MPI.Comm, parametric: bool = False
-    ) -> None:
+        self, mesh: Mesh, material: Material, comm: MPI.Comm, parametric: bool = False,
+        degree: int = 2,
+    ) -> None:  # fmt: skip
         if mesh.element != "T6":
             raise InputError(f"finite elements: expected a T6 mesh, got {mesh.element}")
         domain = dolfinx_api.create_mesh(mesh, comm)
-        self.V = dolfinx.fem.functionspace(domain, ("Lagrange", 2, (2,)))
+        self.V = dolfinx.fem.functionspace(domain, ("Lagrange", degree, (2,)))
         self.u = dolfinx.fem.Function(self.V)
         self.constants: dict[str, Any] = {}
         if parametric:
             material, self.constants = _with_constants(material, domain)
         test, trial = ufl.TestFunction(self.V), ufl.TrialFunction(self.V)
         F = ufl.Identity(2) + ufl.grad(self.u)
-        energy = material.energy(F) * ufl.Measure("dx", domain=domain, metadata=_THREE_POINTS)
+        rule = {"quadrature_degree": 2 * degree - 2}  # for 2 on a triangle: three Gauss points
+        energy = material.energy(F) * ufl.Measure("dx", domain=domain, metadata=rule)
         self._forces: Any = ufl.derivative(energy, self.u, test)
         form = dolfinx.fem.form
         self.energy: Any = form(energy)
@@ -62,6 +66,12 @@ class Hyperelastic:
     def stiffness_along(self, direction: dolfinx.fem.Function) -> Any:
         """The form of the stiffness times a displacement: how forces change along it."""
         return dolfinx.fem.form(ufl.derivative(self._forces, self.u, direction))
+
+    def sampled(self, points: FloatArray) -> Callable[[], FloatArray]:
+        """What gives u (m, k, 2) at points (k, 2) of all elements in their order; on one rank."""
+        at_points = dolfinx.fem.Expression(self.u, points)
+        number = np.argsort(self.V.mesh.topology.original_cell_index).astype(np.int32)
+        return lambda: np.reshape(at_points.eval(self.V.mesh, number), (len(number), -1, 2))
 
     def smallest_jacobian(self) -> float:
         """Smallest det F at the corners and mid-sides of this rank's elements [-]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ import pytest
 from documented_keys import undocumented
 
 from modeharvest.cli.root import main
+from modeharvest.fem.field import Mesh
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.finite_element.mesh import quadratic
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.imaging.grid import PixelGrid
@@ -33,6 +36,7 @@ from modeharvest.validation.design import (
     DesignRanges,
     averaged_noise,
 )
+from modeharvest.validation.design_parameters import ModelStates
 
 SPECIMEN = Specimen(2, 3, bulk_x=0.6, bulk_y=0.5)
 DEGREES = SquareLatticeOptions(v0_degree=2, v_degree=2)
@@ -261,4 +265,87 @@ def test_the_paper_s_case_is_designed_as_it_is_shipped(
     assert (np.diff(errors, axis=0) > 0).all()
     assert (np.diff(errors, axis=1) > 0).all()
     page = (tmp_path / "report.html").read_text("utf-8")
-    assert "are no part of this design yet" in page
+    assert "model’s parameters" not in page
+
+
+def stretched(names: tuple[str, ...] = ("a", "b", "c")) -> Design:
+    """The specimen under a uniform strain a, times b across, and a force a c, at two strains."""
+    half = SPECIMEN.half_size
+    grid = np.meshgrid(np.linspace(-half[0], half[0], 9), np.linspace(-half[1], half[1], 9))
+    x, y = (axis.ravel() for axis in grid)
+    corner = (9 * np.arange(8)[:, None] + np.arange(8)).ravel()
+    cells = np.hstack([[corner, corner + 1, corner + 10], [corner, corner + 10, corner + 9]]).T
+    mesh = quadratic(Mesh(np.stack([x, y], 1), cells, "T3"))
+    (x, y), zero = mesh.nodes.T, np.zeros(len(mesh.nodes))
+    a, b, c = -1.0, -0.5, 2.0
+
+    def state(e: float) -> SimpleNamespace:
+        by_a, by_b = np.stack([e * x, e * b * y], 1), np.stack([zero, e * a * y], 1)
+        return SimpleNamespace(
+            mesh=mesh, displacement=e * a * np.stack([x, b * y], 1),
+            displacement_by=np.array([by_a, by_b, 0.0 * by_a]), nodes_by=np.zeros((3, len(x), 2)),
+            force_by=np.array([-e * c, 0.0, -e * a]),
+        )  # fmt: skip
+
+    states = {e: state(e) for e in (0.04, 0.06, 0.08)}
+    model = ModelStates(names, np.array([a, b, c]), states, (0.04, 0.08), 1e-3)  # type: ignore[arg-type]
+    options = DesignOptions(pattern=0.25, parameters=names)
+    return Design(SPECIMEN, DEEP, replace(DEGREES, edge_px=2), options, 0.08, None, model)
+
+
+def test_a_model_s_parameters() -> None:
+    """In closed form: u is linear in x, so the integral is that of x x, y y over the material."""
+    of, e = stretched(), (0.04, 0.08)
+    setup, signal = of.setup, of.signal(of.setup)
+    inside = of.points[of.used(2 * setup.pixel_size)]
+    area = 4.0 * np.prod(SPECIMEN.half_size) / len(of.points)
+    M = np.zeros((3, 3))
+    for strain in e:
+        lx, ly = 1.0 - strain, 1.0 + 0.5 * strain
+        weight = signal * area / (1.0 + 1.0 / (lx * ly))
+        xx, yy = (inside**2).sum(axis=0) * weight / np.array([lx, ly]) ** 2
+        M[0, 0] += strain**2 * (xx + 0.25 * yy)
+        M[0, 1] += 0.5 * strain**2 * yy
+        M[1, 1] += strain**2 * yy
+        J = strain * np.array([-2.0, 0.0, 1.0]) / 1e-3
+        M += np.outer(J, J)
+    M[1, 0] = M[0, 1]
+    sd = np.sqrt(np.diag(np.linalg.inv(M)))
+    found = of.expected(setup)
+    assert found.parameter_sd == pytest.approx(sd, rel=1e-5)
+    assert found.parameter_percent == pytest.approx(max(100 * sd / [1.0, 0.5, 2.0]), rel=1e-5)
+    coarse = of.expected(replace(setup, noise=2 * setup.noise)).parameter_sd
+    assert coarse[1] / sd[1] == pytest.approx(2.0, rel=0.01)
+    assert coarse[2] < 2.0 * sd[2]  # the load cell stays as it is
+    weighed = replace(of, model=replace(of.model, force_sd=0.0), _known={})  # type: ignore[type-var]
+    with pytest.raises(InputError, match="none that determine c; give the load cell's force_sd"):
+        weighed.parameter_sd(setup)
+    assert (of.parameter_sd(replace(setup, strain=0.06)) > sd).all()
+    with pytest.raises(InputError, match=r"expected a model with a state at 0\.07, got none"):
+        of.parameter_sd(replace(setup, strain=0.07))
+    with pytest.raises(InputError, match="expected a model whose parameters are sought, got none"):
+        replace(of, model=None)
+
+
+@pytest.mark.dolfinx
+def test_a_design_for_a_material(tmp_path: Path) -> None:
+    """Photographs alone know an exponent, no modulus; a load cell changes that."""
+    tables: dict[str, Any] = {
+        "experiment": {"specimen": {"holes_x": 2, "holes_y": 2}, "strains": [0.03, 0.06],
+                       "mesh_size": 0.55},
+        "imaging": {"pixel_size": 0.03, "sensor": {"read_noise": 0.01}},
+        "correlation": {"v0_degree": 2, "v_degree": 2},
+    }  # fmt: skip
+    asked = {
+        "pattern": 0.2, "parameters": ["moduli[0]", "kappa"], "contour": "parameter_percent",
+        "ranges": {"strain": [0.05, 0.06], "v0_degree": [2], "v_degree": [2]},
+    }  # fmt: skip
+    with pytest.raises(InputError, match=r"none that determine moduli\[0\] and kappa; give the"):
+        run(checked(DesignCase, tables | {"design": asked}, "mine"), tmp_path)
+    case = checked(DesignCase, tables | {"design": asked | {"force_sd": 0.002}}, "mine")
+    summary = run(case, tmp_path)
+    assert 0.0 < summary["expected"]["parameter_sd"][0] < 0.05
+    coarse = summary["varied"]["pixel_size"][-1]
+    assert (np.array(coarse["parameter_sd"]) > summary["expected"]["parameter_sd"]).all()
+    assert undocumented(summary, "design.md") == set()
+    assert summary["map"]["errors"][0][0] > 0.0

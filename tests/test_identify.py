@@ -312,7 +312,7 @@ def test_what_a_mesh_is_wrong_by_does_not_make_a_law_wrong() -> None:
 
     given = {"pixel_size": 0.04, "corrections": CORRECTIONS, "forces": FORCES}
     found = identify(
-        by_mesh, images(0), UNKNOWNS, finer=FinerMesh(finer, 0.5), **given  # type: ignore[arg-type]
+        by_mesh, images(0), UNKNOWNS, finer=FinerMesh(finer, 0.25), **given  # type: ignore[arg-type]
     )  # fmt: skip
     assert found.model_error is not None
     assert not found.model_error.is_rejected
@@ -329,7 +329,7 @@ def test_a_finer_mesh_has_the_last_word() -> None:
         return model(values + shift)
 
     plain = found_from(0, levels=(FULL,))
-    found = found_from(0, levels=(FULL,), finer=FinerMesh(states, 0.5))
+    found = found_from(0, levels=(FULL,), finer=FinerMesh(states, 0.25))
     assert np.all(np.abs(found.minimum.unknowns + shift - plain.values) < 0.2 * plain.sd)
     assert np.all(np.abs(found.values + 4.0 / 3.0 * shift - plain.values) < 0.2 * plain.sd)
     assert np.all(np.abs(found.mesh_error + shift / 3.0) < 0.1 * plain.sd)

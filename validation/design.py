@@ -15,9 +15,10 @@ What the ansatz can't describe, w, is no noise, and no part of these errors.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import pi
 from typing import Any
 
@@ -40,7 +41,9 @@ from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.imaging.speckle.statistics import SpeckleStatistics
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
+from modeharvest.util.scaled_eigen import ScaledEigen
 from modeharvest.util.typed import quantity
+from modeharvest.validation.design_parameters import ModelStates
 from modeharvest.validation.truth import rms
 
 _POINTS = 16_384
@@ -48,6 +51,8 @@ _POINTS = 16_384
 _PER_CELL = 24
 """Places a pitch at which a simulated displacement is fitted by the ansatz."""
 _HARMONICS = 20
+Mapped = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""F (k, 2, 2) of a state and derivatives of u (k, 2, n), at points (k, 2) [mm]."""
 LARGEST = 0.04
 """Of ||phi|| [-], as modes are scaled."""
 
@@ -89,7 +94,13 @@ class DesignOptions:
     v1_percent: float = 0.02
     wave_number: float = 3e-5
     phase: float = 1e-4
+    parameter_percent: float = 1.0
     """Wanted, of the :class:`ExpectedErrors`."""
+    parameters: tuple[str, ...] = ()
+    """To be identified from all states' images and forces, as in ``[unknowns]`` of an
+    identification; none by default."""
+    force_sd: float = 0.0
+    """Of the load cell; 0 for a test without [N/mm]."""
     strain: float | None = None
     """Of the state [-]; by default the case's last."""
     pattern: float | None = None
@@ -104,13 +115,19 @@ class DesignOptions:
     ranges: DesignRanges = field(default_factory=DesignRanges)
 
     def __post_init__(self) -> None:
-        for name in (*WANTED, "noise", "pattern", "strain"):
+        require_within("design: expected force_sd [N/mm]", self.force_sd, 0.0)
+        for name in (*WANTED, "parameter_percent", "noise", "pattern", "strain"):
             if (value := getattr(self, name)) is not None:
                 require_within(f"design: expected a {name}", value, 0.0, above=True)
         require_within("design: expected exposures", self.exposures, 1)
-        if len({*self.map} & {*NEEDED}) < 2 or self.contour not in WANTED:
-            wanted = f"two of {list(NEEDED)} as map and one of {list(WANTED)} as contour"
+        if len({*self.map} & {*NEEDED}) < 2 or self.contour not in self.wanted:
+            wanted = f"two of {list(NEEDED)} as map and one of {list(self.wanted)} as contour"
             raise InputError(f"design: expected {wanted}, got {self.map} and {self.contour!r}")
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Names of the errors that are looked at."""
+        return (*WANTED, "parameter_percent") if self.parameters else WANTED
 
 
 @dataclass(frozen=True)
@@ -137,9 +154,13 @@ class ExpectedErrors:
     wave_number: float = quantity("wave numbers, largest")
     phase: float = quantity("phases, largest", "mm")
     image_noise: float = quantity("noise of an image", "% of full scale")
+    parameter_percent: float | None = quantity("parameters, largest", "% of the value")
+    """Of those whose value isn't 0; None if none are sought."""
     w_px: float | None = quantity("model error, rms", "px")
     """What the ansatz leaves of the simulated displacement: no part of the others. None if that
     was not simulated: a pattern that was given, another strain."""
+    parameter_sd: tuple[float, ...] = ()
+    """Of each that is sought, in its own unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,15 +187,19 @@ class PatternState:
         fit = fit_displacement(target, grid, ansatz, start, found.mask)
         return cls(fit.ansatz, fit.unknowns, fit.residual_rms)
 
-    def weighted(self, at: FloatArray) -> FloatArray:
-        """(k, 2, n) R S with R'R = (F F')⁻¹ / (1 + 1/det F) at points (k, 2) [mm]."""
+    def mapped(self, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """F (k, 2, 2) and derivatives of u by the unknowns (k, 2, n) at points (k, 2) [mm]."""
         ansatz, a, F = self.ansatz, self.unknowns, np.tile(np.eye(2), (len(at), 1, 1))
         for k, step in enumerate(1e-5 * np.eye(2)):
             ahead, behind = (ansatz.displacement_at(a, at + s) for s in (step, -step))
             F[:, :, k] += (ahead - behind) / 2e-5
-        S = ansatz.sensitivities(a, *at.T[..., None])[:, 0]
-        root = (1.0 + 1.0 / np.linalg.det(F)) ** -0.5
-        return np.asarray(root[:, None, None] * np.linalg.solve(F, S))
+        return F, ansatz.sensitivities(a, *at.T[..., None])[:, 0]
+
+
+def _weighted(F: FloatArray, S: FloatArray) -> FloatArray:
+    """(k, 2, n) R S with R'R = (F F')⁻¹ / (1 + 1/det F)."""
+    root = (1.0 + 1.0 / np.linalg.det(F)) ** -0.5
+    return np.asarray(root[:, None, None] * np.linalg.solve(F, S))
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,12 +214,16 @@ class Design:
     """Nominal, of the state designed for [-]."""
     solution: Solution | None = None
     """Its displacement; not looked at where the options give a pattern."""
+    model: ModelStates | None = None
+    """States of the model whose parameters are sought; needed if any are."""
     _known: dict[Any, Any] = field(default_factory=dict)
     """States, their integrands, signals with their errors, speckles, by what they depend on."""
 
     def __post_init__(self) -> None:
         if self.options.pattern is None and self.solution is None:
             raise InputError("design: expected a solution or a pattern [mm], got neither")
+        if self.options.parameters and self.model is None:
+            raise InputError("design: expected a model whose parameters are sought, got none")
 
     @property
     def setup(self) -> DesignSetup:
@@ -285,7 +314,46 @@ class Design:
         assert isinstance(known, ExpectedErrors)
         times, noise = (signal / self.signal(setup)) ** 0.5, 100.0 * self.image_noise(setup)
         errors = {name: times * getattr(known, name) for name in ("u_px", "v1_px", *WANTED)}
+        if self.model is not None:
+            sds = self.parameter_sd(setup)
+            shares = [100.0 * s / abs(v) for s, v in zip(sds, self.model.values, strict=True) if v]
+            largest = max(shares, default=0.0)
+            known = replace(known, parameter_percent=largest, parameter_sd=tuple(sds))
         return replace(known, image_noise=noise, **errors)
+
+    def parameter_sd(self, setup: DesignSetup) -> FloatArray:
+        """(k,) standard deviations of the model's parameters.
+
+        By the images and forces of all states; that of the setup's strain is the last. InputError
+        if the model has no state of that strain, or if nothing shows one of the parameters.
+        """
+        model, last = self.model, setup.strain
+        if model is None or last not in model.states:
+            raise InputError(f"design: expected a model with a state at {last:g}, got none")
+        key = "information", last, setup.pixel_size
+        if key not in self._known:
+            by = ((e, partial(model.mapped, e)) for e in model.photographed(last))
+            self._known[key] = sum(self._information(("model", e), f, setup) for e, f in by)
+        M = self.signal(setup) * self._known[key] + model.by_forces(last)
+        sd = np.sqrt(np.diag(ScaledEigen.of(M).inverse()))
+        if not np.isfinite(sd).all():
+            lost = " and ".join(n for n, s in zip(model.names, sd, strict=True) if np.isinf(s))
+            raise InputError(
+                f"design: expected data that show every parameter, got none that determine {lost}; "
+                "give the load cell's force_sd, or leave one out"
+            )
+        return np.asarray(sd)
+
+    def _information(self, key: Any, mapped: Mapped, setup: DesignSetup) -> FloatArray:
+        """(n, n) ∫ S' (F F')⁻¹ S / (1 + 1/det F) dA over the pixels that are used [mm²]."""
+        if key not in self._known:
+            inside, points = self.used(0.0), self.points
+            found = _weighted(*mapped(points[inside]))
+            self._known[key] = np.zeros((len(points), *found.shape[1:]))
+            self._known[key][inside] = found
+        used = self.used(self.correlation.edge_px * setup.pixel_size)
+        H = self._known[key][used].reshape(-1, self._known[key].shape[-1])
+        return np.asarray(H.T @ H * 4.0 * float(np.prod(self.specimen.half_size)) / _POINTS)
 
     def varied(self, axis: str) -> list[tuple[float, ExpectedErrors]]:
         """The errors with one of :data:`AXES` varied over its range, all else as in the case.
@@ -337,20 +405,16 @@ class Design:
         """(n, n) bound of the unknowns' covariance; InputError if one of them doesn't show."""
         state = self.state(setup)
         key = "integrand", setup.v0_degree, setup.v_degree, setup.strain
-        if key not in self._known:
-            self._known[key] = state.weighted(self.points)
-        used = self.used(self.correlation.edge_px * setup.pixel_size)
-        H = self._known[key][used].reshape(-1, state.ansatz.size)
-        weight = self.signal(setup) * 4.0 * float(np.prod(self.specimen.half_size)) / _POINTS
-        scale = np.linalg.norm(H, axis=0)
+        M = self.signal(setup) * self._information(key, state.mapped, setup)
+        scale = np.sqrt(np.diag(M))
         if not (scale > 0.0).all():
             lost = state.ansatz.names[int(np.argmin(scale))]
             raise InputError(
                 f"design: expected a pattern and pixels that show every unknown, got nothing of "
                 f"{lost} at {setup.pixel_size:g} mm/px"
             )
-        H = H / scale
-        return np.asarray(np.linalg.inv(H.T @ H) / (weight * np.outer(scale, scale)))
+        sizes = np.outer(scale, scale)
+        return np.asarray(np.linalg.inv(M / sizes) / sizes)
 
     def _errors(self, setup: DesignSetup) -> ExpectedErrors:
         """From the covariance, all but the image's noise."""
@@ -372,6 +436,7 @@ class Design:
             wave_number=float(waves[:, 2:4].max()),
             phase=float(waves[:, 4].max()),
             image_noise=0.0,
+            parameter_percent=None,
             w_px=None if state.w is None else state.w / p,
         )
 

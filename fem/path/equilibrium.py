@@ -20,9 +20,19 @@ from modeharvest.fem.experiment import require_edges
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.hyperelastic import Hyperelastic
 from modeharvest.fem.materials import Material
+from modeharvest.fem.meshing import MeshBlock, join
 from modeharvest.fem.path.factor import BodyFactor, factorise
 from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.elements import reference_element, shape_functions
 from modeharvest.util.errors import InputError
+
+_QUARTERS = np.concatenate([
+    origin + 0.5 * sign * reference_element("T6").nodes
+    for *origin, sign in ((0.0, 0.0, 1), (0.5, 0.0, 1), (0.0, 0.5, 1), (0.5, 0.5, -1))
+])  # fmt: skip
+_AT_QUARTERS = shape_functions("T6", _QUARTERS)
+"""Nodes of the four T6 elements that divide one, in its local coordinates; shape functions there.
+"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +61,9 @@ class Structure:
     Vectors are PETSc vectors over all displacement components; ``u`` includes the constrained ones.
     ``factorisations`` counts every numerical factorisation. The mesh (T6) is needed on rank 0 only.
     ``constants`` are the material's that can be changed: all of them if ``parametric``. ``nodes``
-    are where the mesh's nodes are now, see :meth:`place` [mm].
+    are where the mesh's nodes are now, see :meth:`place` [mm]. With a ``degree`` above 2
+    displacements are polynomials of that on each element, on one rank, and given at the nodes of
+    ``shown``: its quarters; else that is the mesh itself.
     """
 
     def __init__(
@@ -61,9 +73,17 @@ class Structure:
         loading: EdgeCompression,
         comm: MPI.Comm = MPI.COMM_WORLD,
         parametric: bool = False,
+        degree: int = 2,
     ) -> None:
         self.mesh, self.comm, self.nodes = mesh, comm, mesh.nodes
-        self._forms = Hyperelastic(mesh, material, comm, parametric)
+        self._forms = Hyperelastic(mesh, material, comm, parametric, degree)
+        self.shown, self._quadratic, self._sampled = mesh, self._forms.V, None
+        if degree > 2:
+            self._quadratic = dolfinx.fem.functionspace(self._forms.V.mesh, ("Lagrange", 2, (2,)))
+            self._sampled = self._forms.sampled(_QUARTERS)
+            x = np.einsum("pa,mai->mpi", _AT_QUARTERS, mesh.nodes[mesh.cells]).reshape(-1, 2)
+            cells = np.arange(len(x)).reshape(-1, 6)
+            self.shown = join([MeshBlock(x, cells)], 1e-8 * float(np.ptp(x[:, 0])))
         self.constants = self._forms.constants
         self.V, self._u = self._forms.V, self._forms.u
         self._direction, self._along = (dolfinx.fem.Function(self.V) for _ in range(2))
@@ -119,16 +139,34 @@ class Structure:
     def constrained(self, field: FloatArray) -> PETSc.Vec:
         """Vector with the constrained components of nodal values (n, 2) only; on one rank."""
         vector, fixed = self.zero(), self._fixed_owned
-        values = np.empty_like(vector.array)
-        values[self._order] = field.ravel()
-        vector.array[fixed] = values[fixed]
+        values, quadratic = (dolfinx.fem.Function(V) for V in (self.V, self._quadratic))
+        quadratic.x.array[self._order] = field.ravel()
+        values.interpolate(quadratic)
+        vector.array[fixed] = values.x.array[fixed]
         return vector
+
+    @cached_property
+    def shortening(self) -> PETSc.Vec:
+        """d(constrained displacements)/d(strain) of straight edges [mm], zero elsewhere."""
+        vector, fixed = self.zero(), self._fixed_owned
+        vector.array[fixed] = self._shortening[fixed]
+        return vector
+
+    def on_shown(self, field: FloatArray) -> FloatArray:
+        """Nodal values (n, 2) at the nodes of ``shown``, quadratic between them."""
+        if self._sampled is None:
+            return field
+        found = np.empty_like(self.shown.nodes)
+        values = np.einsum("pa,mai->mpi", _AT_QUARTERS, field[self.mesh.cells])
+        found[self.shown.cells] = values.reshape(-1, 6, 2)
+        return found
 
     @cached_property
     def _order(self) -> IntArray:
         """Position in dolfinx's order of every component in the order of the nodes."""
         count = len(self.mesh.nodes)
-        numbers = dolfinx_api.gather_nodes(self.V, np.arange(2 * count, dtype=np.float64), count)
+        every = np.arange(2 * count, dtype=np.float64)
+        numbers = dolfinx_api.gather_nodes(self._quadratic, every, count)
         return np.rint(numbers).astype(np.int64).ravel()
 
     def zero(self) -> PETSc.Vec:
@@ -142,8 +180,12 @@ class Structure:
         u.array[self._fixed_owned] = strain * self._direction.x.array[self._fixed_owned]
 
     def nodal(self, u: PETSc.Vec) -> FloatArray:
-        """(n, 2) displacement at the mesh's nodes, in their order [mm]; on every rank."""
+        """(n, 2) displacement at the nodes of ``shown``, in their order [mm]; on every rank."""
         self._load(u)
+        if self._sampled is not None:
+            found = np.empty_like(self.shown.nodes)
+            found[self.shown.cells] = self._sampled().reshape(-1, 6, 2)
+            return found
         count = self.comm.bcast(len(self.mesh.nodes))
         return dolfinx_api.gather_nodes(self.V, self._u.x.array, count)
 
@@ -218,9 +260,7 @@ class Structure:
 
     def reaction_of(self, forces: PETSc.Vec, length: float) -> float:
         """The same of internal forces, or of their change: it is linear in them."""
-        fixed = self._fixed_owned
-        work = float(forces.array[fixed] @ self._shortening[fixed])
-        return float(self.comm.allreduce(work)) / length
+        return float(forces.dot(self.shortening)) / length
 
     def smallest_jacobian(self, u: PETSc.Vec) -> float:
         """Smallest det F at the corners and mid-sides of all elements [-]."""

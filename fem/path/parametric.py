@@ -1,18 +1,19 @@
 """A compression test whose material and supports are parameters: its states and sensitivities.
 
-Forms are compiled once, with the parameters as constants. The states of each set of parameters are
+Forms are compiled once, with the parameters as constants. The states of a set of parameters are
 found along the whole path, from the undeformed specimen through its critical point to the branch
-that is asked for, so they do not depend on what was tried before. What breaks the specimen's mirror
-symmetry comes last (a tilt, holes of their own): at each state of the specimen without it, brought
-in while the strain is kept, which stays on the branch of that name where the natural path would
-lead to whichever branch it favours.
+that is asked for. What breaks the specimen's mirror symmetry comes last (a tilt, holes of their
+own): at each state of the specimen without it, brought in while the strain is kept, which stays on
+the branch of that name where the natural path would lead to whichever branch it favours. States of
+parameters nearby follow from these at a fraction of the cost: the sensitivities predict them,
+Newton's method corrects, and the inertia says that they are still stable.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -20,10 +21,11 @@ from petsc4py import PETSc
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.meshing import hole_motion
+from modeharvest.fem.meshing import hole_motion, mesh_specimen, perturb
 from modeharvest.fem.path.bifurcation import Critical, follow_branch, locate_critical
 from modeharvest.fem.path.continuation import BranchPoint, PathFollower, State, load_at, value_at
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
+from modeharvest.fem.path.factor import BodyFactor
 from modeharvest.fem.path.newton import Constraint
 from modeharvest.fem.path.parameters import TILT, TRAVEL, holes_of, parameter, require_open
 from modeharvest.fem.path.sensitivity import (
@@ -37,9 +39,12 @@ from modeharvest.util.errors import InputError
 
 _SIGNS = {"buckled+": 1, "buckled-": -1}
 _SHORTEST = 1 / 64  # of what breaks the symmetry, or of an amplitude, in one step
-_NO_PATTERN = 1e-6  # overlap of a mode with the pattern
+_NO_PATTERN = 1e-6  # overlap of a mode with the pattern [-], or its amplitude [mm]
 _BEYOND = 2.0  # times the last strain: where to look for a critical point at most
 _ATTEMPTS = 3  # with shorter and shorter steps
+_OFF, _JUMP = 0.5, 0.05
+"""Most by which a state may be off its prediction: of the step to that, or of all its u."""
+_KEPT = 0.3  # of a buckled state's pattern, at least, in one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +68,16 @@ class ParametricState:
     """(k,) [N/mm per unit]."""
     strain_by: FloatArray
     """(k,) [1 per unit]."""
+    amplitude: float = 0.0
+    """Of the pattern: the displacement's projection on it [mm]."""
+
+
+class _Known(NamedTuple):
+    """A state that was found, and its derivatives by the unknowns; () if they weren't wanted."""
+
+    state: State
+    branch: str
+    by: Sequence[Sensitivity] = ()
 
 
 class ParametricTest:
@@ -73,15 +88,20 @@ class ParametricTest:
         "amplitude[k]" the state number k is found by the pattern's amplitude [mm] instead of its
         nominal strain.
     mesh : T6, of the specimen.
+    degree : of the displacement's polynomials over an element. With one above 2 the states are
+        given on another ``mesh``, that of its quarters.
     """
 
-    def __init__(self, experiment: Experiment, names: Sequence[str], mesh: Mesh) -> None:
+    def __init__(
+        self, experiment: Experiment, names: Sequence[str], mesh: Mesh, degree: int = 2
+    ) -> None:
         spec = experiment.specimen
         pins = spec.mid_junctions if experiment.guided else ()
         loading = EdgeCompression(spec.half_size[0], spec.length, experiment.edges, 0.0, pins)
         comm = MPI.COMM_SELF
-        self.structure = Structure(mesh, experiment.material, loading, comm, parametric=True)
-        self.experiment, self.names, self.mesh = experiment, tuple(names), mesh
+        self.structure = Structure(mesh, experiment.material, loading, comm, True, degree)
+        self.experiment, self.names, self.mesh = experiment, tuple(names), self.structure.shown
+        self._nodes = mesh.nodes
         self._parameters = {name: parameter(name, experiment) for name in (*names, TILT)}
         self._variations = {name: self._variation(name) for name in self._parameters}
         self._follower = PathFollower(self.structure, experiment.path)
@@ -90,48 +110,108 @@ class ParametricTest:
         square = float(weighted.dot(pattern))
         self._weights, self._norm = (1.0 / square) * weighted, float(np.sqrt(square))
         self.critical_strain: float | None = None
-        """Of the last values, if there is a bifurcation [-]."""
+        """Of the last values whose path was followed, if there is a bifurcation [-]."""
+        self._last: tuple[FloatArray, list[_Known]] | None = None
+
+    @classmethod
+    def meshed(
+        cls, experiment: Experiment, names: Sequence[str], degree: int = 3
+    ) -> ParametricTest:
+        """A test on a mesh of the experiment's own size, its holes scattered as they are there."""
+        spec = experiment.specimen
+        mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
+        return cls(experiment, names, mesh, degree)
+
+    @property
+    def own_values(self) -> FloatArray:
+        """(k,) values of the parameters in the experiment: of its material, 1 of a travel."""
+        known = {name: float(c.value) for name, c in self.structure.constants.items()}
+        known |= {TRAVEL: 1.0, TILT: self.experiment.tilt}
+        return np.array([known.get(name, 0.0) for name in self.names])
 
     @property
     def unknowns(self) -> int:
         """How many displacements are sought."""
-        return self.mesh.nodes.size
-
-    def amplitude(self, displacement: FloatArray) -> float:
-        """The pattern's amplitude in nodal displacements (n, 2) [mm]: its projection on it."""
-        from_nodes = self.structure.nodal(self._weights)
-        return float(np.sum(from_nodes * displacement))
+        return int(self._weights.size)
 
     def at(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
         """The states for values of the unknowns (k,), in the order of ``names``.
 
         InputError if the path does not reach one of them.
         """
+        first, late, travel, amplitudes = self._given(values)
+        self._vary(first)
+        known = []
+        for k, (state, branch) in enumerate(self._states(travel, amplitudes)):
+            weights, factor = None if amplitudes[k] is None else self._weights, None
+            if late.nodes.any() or late.edges.any():
+                state, factor = self._bent(state, first, late, weights), self._factor
+            by = self._by(state, k, travel, weights, factor) if with_derivatives else ()
+            known.append(_Known(state, branch, by))
+        self._last = np.array(values), known
+        return [self._result(*one) for one in known]
+
+    def near(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
+        """The same, in one step from the states found last where that leads to their branches.
+
+        Where it leads to no equilibrium, to an unstable one, far from what was predicted or out of
+        the pattern, and where there are no states yet, the whole path is followed.
+        """
+        if self._last is None:
+            return self.at(values, with_derivatives)
+        first, late, travel, amplitudes = self._given(values)
+        self._vary(first, 1.0, late)
+        change, known = values - self._last[0], []
+        for k, before in enumerate(self._last[1]):
+            guess, strain, constraint = before.state.u.copy(), before.state.strain, None
+            for part, rate in zip(change, before.by, strict=False):
+                guess.axpy(float(part), rate.displacement)
+                strain += float(part) * rate.strain
+            if (amplitude := amplitudes[k]) is None:
+                strain = travel * self.experiment.strains[k]
+            else:
+                constraint = Constraint(self._weights, self.structure.zero(), amplitude)
+            self._follower.linearisation = None
+            state = self._follower.equilibrium(strain, guess, constraint, with_modes=False)
+            if state is None or state.negative_pivots > before.state.negative_pivots:
+                return self.at(values, with_derivatives)
+            step, size = (guess - before.state.u).norm(), before.state.u.norm()
+            if (state.u - guess).norm() > max(_OFF * step, _JUMP * size):
+                return self.at(values, with_derivatives)
+            was, now = (float(self._weights.dot(s.u)) for s in (before.state, state))
+            is_lost = now * np.sign(was) < max(_KEPT * abs(was), _NO_PATTERN)
+            if before.branch != "primary" and amplitude is None and is_lost:
+                return self.at(values, with_derivatives)
+            weights = None if amplitude is None else self._weights
+            by = self._by(state, k, travel, weights, self._factor) if with_derivatives else ()
+            known.append(_Known(state, before.branch, by))
+        self._last = np.array(values), known
+        return [self._result(*one) for one in known]
+
+    def _given(
+        self, values: FloatArray
+    ) -> tuple[Variation, Variation, float, dict[int, float | None]]:
+        """What keeps the symmetry and what breaks it, travel and amplitudes; constants are set."""
         given = dict(zip(self.names, map(float, values), strict=True))
         for name, constant in self.structure.constants.items():
             constant.value = given.get(name, float(constant.value))
-        travel = given.get(TRAVEL, 1.0)
         amplitudes = {k: given.get(f"amplitude[{k}]") for k in range(len(self.experiment.strains))}
-        given = {TILT: self.experiment.tilt, **given}
+        travel, given = given.get(TRAVEL, 1.0), {TILT: self.experiment.tilt, **given}
         off = holes_of(list(given), list(given.values()), self.experiment)
         require_open(self.experiment.specimen, off)
         keeping = {name for name in given if self._parameters[name].is_symmetric}
         first, late = self._sum(given, keeping), self._sum(given, given.keys() - keeping)
-        mesh = self.mesh
-        if off.any():
-            mesh = replace(mesh, nodes=mesh.nodes + first.nodes + late.nodes)
-        self._vary(first)
-        found = []
-        for k, (state, branch) in enumerate(self._states(travel, amplitudes)):
-            weights = None if amplitudes[k] is None else self._weights
-            if late.nodes.any() or late.edges.any():
-                state = self._bent(state, first, late, weights)
-            found.append(self._result(state, mesh, branch, k, travel, weights, with_derivatives))
-        return found
+        return first, late, travel, amplitudes
+
+    @property
+    def _factor(self) -> BodyFactor | None:
+        """Of the equilibrium found last."""
+        near = self._follower.linearisation
+        return None if near is None else near.factor
 
     def _variation(self, name: str) -> Variation:
         """How the structure changes with a parameter."""
-        found, spec, nodes = self._parameters[name], self.experiment.specimen, self.mesh.nodes
+        found, spec, nodes = self._parameters[name], self.experiment.specimen, self._nodes
         zero = np.zeros_like(nodes)
         return Variation(
             zero if found.holes is None else hole_motion(nodes, spec, found.holes),
@@ -141,7 +221,7 @@ class ParametricTest:
 
     def _sum(self, values: Mapping[str, float], names: Iterable[str]) -> Variation:
         """What some of the parameters make of nodes and edges together."""
-        nodes, edges = np.zeros_like(self.mesh.nodes), np.zeros_like(self.mesh.nodes)
+        nodes, edges = np.zeros_like(self._nodes), np.zeros_like(self._nodes)
         for name in names:
             nodes += values[name] * self._variations[name].nodes
             edges += values[name] * self._variations[name].edges
@@ -150,7 +230,7 @@ class ParametricTest:
     def _vary(self, first: Variation, share: float = 0.0, late: Variation | None = None) -> None:
         """Have the structure with one variation and a share of another."""
         late = late or first
-        self.structure.place(self.mesh.nodes + first.nodes + share * late.nodes)
+        self.structure.place(self._nodes + first.nodes + share * late.nodes)
         self.structure.lead(first.edges + share * late.edges)
 
     # -- the path -----------------------------------------------------------------------
@@ -293,28 +373,32 @@ class ParametricTest:
 
     # -- its states ---------------------------------------------------------------------
 
-    def _result(
-        self, state: State, mesh: Mesh, branch: str, number: int, travel: float,
-        weights: PETSc.Vec | None, with_derivatives: bool,
-    ) -> ParametricState:  # fmt: skip
+    def _by(
+        self, state: State, number: int, travel: float, weights: PETSc.Vec | None,
+        factor: BodyFactor | None,
+    ) -> list[Sensitivity]:  # fmt: skip
+        """Derivatives by all unknowns: zero by amplitudes of other states."""
         structure, length = self.structure, self.experiment.specimen.length
-        by: list[Sensitivity | None] = []
-        names = self.names if with_derivatives else ()
-        if names:
-            own = [n for n in names if not n.startswith("amplitude")]
-            variations = [None if n == TRAVEL else self._variations[n] for n in own]
-            parts = sensitivities(structure, state, variations, length, weights, travel)
-            known: dict[str, Any] = dict(zip(own, parts, strict=True))
-            if weights is not None:
-                derivative = amplitude_sensitivity(structure, state, length, weights)
-                known[f"amplitude[{number}]"] = derivative
-            by = [known.get(name) for name in names]
-        zero = np.zeros_like(self.mesh.nodes)
-        fields = [zero if s is None else structure.nodal(s.displacement) for s in by]
+        own = [n for n in self.names if not n.startswith("amplitude")]
+        variations = [None if n == TRAVEL else self._variations[n] for n in own]
+        parts = sensitivities(structure, state, variations, length, weights, travel, factor)
+        known: dict[str, Any] = dict(zip(own, parts, strict=True))
+        if weights is not None:
+            derivative = amplitude_sensitivity(structure, state, length, weights)
+            known[f"amplitude[{number}]"] = derivative
+        nothing = Sensitivity(structure.zero(), 0.0, 0.0)
+        return [known.get(name, nothing) for name in self.names]
+
+    def _result(self, state: State, branch: str, by: Sequence[Sensitivity]) -> ParametricState:
+        structure, length, mesh = self.structure, self.experiment.specimen.length, self.mesh
+        if np.any(structure.nodes != self._nodes):
+            mesh = replace(mesh, nodes=structure.on_shown(structure.nodes))
+        names, shape = self.names[: len(by)], (-1, *mesh.nodes.shape)
+        fields = [structure.nodal(s.displacement) for s in by]
+        moved = [structure.on_shown(self._variations[n].nodes) for n in names]
         return ParametricState(
             state.strain, mesh, structure.nodal(state.u), structure.reaction(state.u, length),
-            state.negative_pivots, branch, np.array(fields).reshape(len(by), *zero.shape),
-            np.array([self._variations[n].nodes for n in names]).reshape(len(by), *zero.shape),
-            np.array([0.0 if s is None else s.force for s in by]),
-            np.array([0.0 if s is None else s.strain for s in by]),
+            state.negative_pivots, branch, np.reshape(fields, shape), np.reshape(moved, shape),
+            np.array([s.force for s in by]), np.array([s.strain for s in by]),
+            float(self._weights.dot(state.u)),
         )  # fmt: skip

@@ -58,8 +58,8 @@ class FinerMesh(NamedTuple):
 
     model: Model
     """Of the same states; their derivatives are of no account."""
-    ratio: float
-    """Of its elements' size to that of the model's own [-]."""
+    error_ratio: float
+    """Of its error to that of the model's own [-]."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Identified:
     """How often the model was solved."""
     mesh_error: FloatArray
     """(k,) taken for what the finer mesh leaves, and added to the values: from how far it moved
-    them, as errors go with the square of the elements' size; 0 where there was no finer mesh."""
+    them and the ratio of errors; 0 where there was no finer mesh."""
     extrapolated: list[ModelState]
     scalars: list[Scalar]
     """States with elements of no size as the finer mesh lets expect them; residuals of forces,
@@ -285,7 +285,7 @@ def identify(
     forces : readings [N/mm], NaN where there is none.
     strains : readings of nominal strains; they count for states that are found by an amplitude.
     finer : a finer mesh, whose residual the last steps take, with this one's sensitivities; from
-        both the values are extrapolated to elements of no size (Richardson).
+        both the values are extrapolated to no error (Richardson).
     corrections : (j, n, 2) of each state's nodal displacements that no law bounds [-], by which the
         model is tested.
     InputError if the model has no states at the start.
@@ -311,7 +311,7 @@ def identify(
     states, begin, factor = cost.states(values), values, 0.0
     if finer is not None:
         values, states = _finished(cost, values, finer)
-        factor = finer.ratio**2 / (1.0 - finer.ratio**2)
+        factor = finer.error_ratio / (1.0 - finer.error_ratio)
     off = (values - begin) * factor
     found = replace(found, unknowns=values)
     result = _assessed(cost, states, found, off, factor, corrections)

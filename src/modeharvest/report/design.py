@@ -33,9 +33,13 @@ _WITHIN = 0.5
 
 def design_report(summary: Summary) -> Report:
     """The report of a design; ``summary``: the content of ``summary.json``."""
+    sought = summary["parameters"]
+    shown_errors = {k: v for k, v in _ERRORS.items() if sought or k != "parameter_percent"}
     varied = [
-        ReportTable(f"Varied: {_AXES[axis]}", [_AXES[axis], *_ERRORS.values()],
-                    [[row["value"], *(row[name] for name in _ERRORS)] for row in rows])
+        ReportTable(f"Varied: {_AXES[axis]}",
+                    [_AXES[axis], *shown_errors.values(), *(f"sd of {name}" for name in sought)],
+                    [[row["value"], *(row[name] for name in shown_errors),
+                      *row["parameter_sd"]] for row in rows])
         for axis, rows in summary["varied"].items() if rows
     ]  # fmt: skip
     shown, wanted = summary["map"], summary["wanted"]
@@ -60,7 +64,7 @@ def design_report(summary: Summary) -> Report:
                        [card for table in varied for card in Card.tabular(table, wide=True)]),
         ],
         warnings=[text_of(f"design-{limit}", w=w, times=w / u)] if limit else [],
-        notes=[text_of(f"design-{name}") for name in ("noise", "speckle", "strain", "material")],
+        notes=[text_of(f"design-{name}") for name in ("noise", "speckle", "strain")],
         command=summary["command"],
         case=summary["case"],
         versions=summary["versions"],
@@ -72,6 +76,10 @@ def findings(summary: Summary) -> list[str]:
     """What is to be expected, in sentences."""
     expected, wanted = summary["expected"], summary["wanted"]
     text = [text_of("design-expected", **expected, setup=summary["setup"])]
+    if names := summary["parameters"]:
+        pairs = zip(names, expected["parameter_sd"], strict=True)
+        found = ", ".join(f"{name} by {number(sd, 3)}" for name, sd in pairs)
+        text.append(text_of("design-parameters", found=found))
     sensor = summary["case"]["imaging"]["sensor"]
     if not sensor["read_noise"] and not sensor["full_well"]:
         text.append(text_of("design-assumed", noise=summary["setup"]["noise"]))

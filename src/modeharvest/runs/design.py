@@ -5,17 +5,19 @@ A case is a virtual experiment's, and may have a table ``[design]``.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
 from modeharvest.fem.field import Solution
 from modeharvest.runs.case import Case, checked, read_tables, table_of_kind
 from modeharvest.runs.experiment import Run
+from modeharvest.util.errors import requiring_dolfinx
 from modeharvest.util.files import require_writable, write_json
 from modeharvest.util.stages import StagedRun, exclusive, versions
 from modeharvest.util.typed import to_plain
-from modeharvest.validation.design import AXES, NEEDED, WANTED, Design, DesignOptions
+from modeharvest.validation.design import AXES, NEEDED, Design, DesignOptions
+from modeharvest.validation.design_parameters import ModelStates
 
 
 class DesignCase(Case):
@@ -48,7 +50,20 @@ class DesignRun(StagedRun[DesignCase]):
         case, strains = self.case, self.case.experiment.strains
         strain, how = case.design.strain or strains[-1], (case.imaging, case.correlation)
         solution = self._solved() if case.design.pattern is None else None
-        return Design(case.experiment.specimen, *how, case.design, strain, solution)
+        model = self._model(strain) if case.design.parameters else None
+        return Design(case.experiment.specimen, *how, case.design, strain, solution, model)
+
+    def _model(self, strain: float) -> ModelStates:
+        """The states of the case's model at all strains that are looked at, and derivatives."""
+        with requiring_dolfinx("the design for a model's parameters needs"):
+            from modeharvest.fem.path.parametric import ParametricTest
+        design, own = self.case.design, self.case.experiment
+        strains = sorted({*own.strains, *design.ranges.strain, strain})
+        test = ParametricTest.meshed(replace(own, strains=tuple(strains)), design.parameters)
+        states = dict(zip(strains, test.at(test.own_values), strict=True))
+        of_test = tuple(e for e in own.strains if e < strain)
+        return ModelStates(design.parameters, test.own_values, states, (*of_test, strain),
+                           design.force_sd)  # fmt: skip
 
     def all(self) -> dict[str, Any]:
         """Leave summary and report; returns the content of ``summary.json``."""
@@ -65,7 +80,9 @@ class DesignRun(StagedRun[DesignCase]):
     def summary(self, design: Design) -> dict[str, Any]:
         """The content of ``summary.json``: docs/design.md."""
         setup, options, state = design.setup, design.options, design.state(design.setup)
+        expected = design.expected(setup)
         varied = {x: [{"value": v, **asdict(e)} for v, e in design.varied(x)] for x in AXES}
+        wanted = options.wanted
         first, second, errors = design.mapped()
         shown = {"first": first, "second": second, "errors": errors}
         found = {
@@ -73,9 +90,10 @@ class DesignRun(StagedRun[DesignCase]):
             "command": f"modeharvest design {self.source} --out {self.folder}",
             "critical_strain": design.critical,
             "setup": setup,
-            "expected": design.expected(setup),
-            "wanted": {name: getattr(options, name) for name in WANTED},
-            "needed": {axis: {n: design.needed(axis, n) for n in WANTED} for axis in NEEDED},
+            "expected": expected,
+            "parameters": [] if design.model is None else design.model.names,
+            "wanted": {name: getattr(options, name) for name in wanted},
+            "needed": {axis: {n: design.needed(axis, n) for n in wanted} for axis in NEEDED},
             "varied": varied,
             "map": {"axes": options.map, "contour": options.contour, **shown},
             "unknowns": state.ansatz.size,

@@ -66,6 +66,10 @@ _FRAME = {"centre": (0.02, "mm"), "orientation": (0.02, "rad"),
           "shift": (0.1, "mm"), "turn": (0.1, "rad")}  # fmt: skip
 """How far unknowns of the camera's frame may be off where they start, lengths over the specimen's,
 and their units."""
+_DEGREE, _FINE_DEGREE = 3, 4
+"""Of the polynomials over an element: of the model, and of the finer mesh and of twins."""
+_ERROR_RATIO = 0.06
+"""Of the errors of these two: docs/identification.md, "Mesh"."""
 _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "fenics-dolfinx")
 
 
@@ -121,20 +125,17 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         data = self.case.data
         return (self.case._base / data.distortion,) if data and data.distortion else ()
 
-    def _model(self, experiment: Experiment, names: list[str]) -> Any:
+    def _model(self, experiment: Experiment, names: list[str], degree: int = _DEGREE) -> Any:
         with requiring_dolfinx("identification needs"):
-            from modeharvest.fem.meshing import mesh_specimen, perturb
             from modeharvest.fem.path.parametric import ParametricTest
-        spec = experiment.specimen
-        mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
-        return ParametricTest(experiment, names, mesh)
+        return ParametricTest.meshed(experiment, names, degree)
 
     def _make_twin(self, twin: TwinTruth | None) -> list[Path]:
         """Images of the true states, and readings of a load cell."""
         assert twin is not None
         true = replace(self.case.experiment, material=twin.material, mesh_size=twin.mesh_size)
         values = twin.every(true)
-        model = self._model(true, list(values))
+        model = self._model(true, list(values), _FINE_DEGREE)
         states = model.at(np.array(list(values.values())), False)
         strains, folder = self.case.experiment.strains, self.folder / "images"
         snapshots = tuple(
@@ -179,13 +180,13 @@ class IdentificationRun(StagedRun[IdentificationCase]):
     ) -> Identified:  # fmt: skip
         """A case's unknowns, and the camera's, by the data."""
         experiment, unknowns = case.experiment, case.unknowns
-        size = self.case.finer_mesh_size or 0.6 * experiment.mesh_size
-        fine = self._model(replace(experiment, mesh_size=size), list(unknowns))
+        size = self.case.finer_mesh_size or 0.7 * experiment.mesh_size
+        fine = self._model(replace(experiment, mesh_size=size), list(unknowns), _FINE_DEGREE)
         has_place = any(name in PLACE for name in frame)
 
         def seen(model: Any, values: FloatArray, with_derivatives: bool) -> list[Any]:
             own, place, motions = np.split(values, [len(unknowns), len(unknowns) + 3 * has_place])
-            states = model.at(own, with_derivatives)
+            states = model.near(own, with_derivatives)
             motions = motions.reshape(-1, 3)
             return [imaged(state, place if has_place else None, motions, k)
                     for k, state in enumerate(states)]  # fmt: skip
@@ -195,7 +196,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             lambda values: seen(model, values, True), data, unknowns | frame, pixel_size=px,
             forces=forces, levels=(*[Level(4, 3.0)] * (f"{MOTION[0]}[0]" in frame), *LEVELS),
             strains=Readings(np.array(experiment.strains), strain_sd),
-            finer=FinerMesh(lambda values: seen(fine, values, False), size / experiment.mesh_size),
+            finer=FinerMesh(lambda values: seen(fine, values, False), _ERROR_RATIO),
             corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
             progress=self.progress,
         )  # fmt: skip

@@ -1,0 +1,279 @@
+"""Material and tilt identified from images and forces: bias, scatter and coverage over seeds, cost.
+
+    scripts/env python benchmarks/identification_statistics.py --seeds 100
+        [--seeds 12 --pixel-size 0.02 --compare] [--fields] [--cost]
+
+A small specimen with known parameters, simulated with polynomials of degree 4, is photographed once
+without noise; each seed adds noise to images and forces and identifies from values off by a factor
+of two, by a model on another mesh, of degree 3, whose last steps have the residual of a third mesh
+of degree 4. A dask campaign: what is stopped goes on. ``--compare``: also by updating the same
+model from displacements that were measured first, as the whole displacement (finite-element DIC
+without a law, started at the best fit of the ansatz) and by pyvale's subsets (MODEHARVEST_PYVALE
+names a Python that has it). ``--fields``: from exact displacements and forces of a fine mesh, by
+coarser ones: the error by the mesh. ``--cost``: what the model's states cost, with and without
+derivatives, along the whole path and from states nearby, of this specimen and of the paper's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Snapshot, Solution
+from modeharvest.fem.path.parametric import ParametricTest
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
+from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.finite_element.identify import FinerMesh, Readings, Unknown, identify
+from modeharvest.idic.finite_element.measure import measure_displacement
+from modeharvest.idic.finite_element.observed import FieldData, ImageData
+from modeharvest.idic.finite_element.pixels import MeshPixels
+from modeharvest.idic.finite_element.result import nodal_values
+from modeharvest.idic.local.subsets import SubsetOptions, subset_field
+from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.files import read_json, write_json
+from modeharvest.validation.campaign import Campaign
+from modeharvest.validation.workers import Workers
+
+FUNCTION = "identification_statistics:one_seed"
+SPECIMEN = Specimen(4, 4, diameter=1.6, bulk_x=0.9, bulk_y=0.4)
+STRAINS = (0.06, 0.12)
+TRUE = {"moduli[0]": 1.2, "exponents[0]": 3.0, "kappa": 5.4, "tilt": 0.01}
+UNKNOWNS = {
+    "moduli[0]": Unknown(2.4, (0.1, 10.0)),
+    "exponents[0]": Unknown(1.5, (0.5, 10.0)),
+    "kappa": Unknown(10.8, (0.5, 100.0)),
+    "tilt": Unknown(0.0, (-0.2, 0.2)),
+}
+NOISE, FORCE_NOISE = 0.01, 0.005
+ERROR_RATIO = 0.06
+"""Of the finer mesh to the model's, as in modeharvest.runs.identification.pipeline."""
+IMAGES, WHOLE, SUBSETS = "images", "whole displacement", "subsets"
+SUBSET = SubsetOptions(subset_px=21, step_px=5, threads=1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--mesh", type=float, default=0.35, help="[mm]")
+    parser.add_argument("--finer-mesh", type=float, default=0.25, help="[mm]")
+    parser.add_argument("--twin-mesh", type=float, default=0.2, help="[mm]")
+    parser.add_argument("--pixel-size", type=float, default=0.03, help="[mm/px]")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--folder", type=Path, default=Path("out/identification"))
+    for name in ("compare", "fields", "cost"):
+        parser.add_argument(f"--{name}", action="store_true")
+    how = parser.parse_args()
+    if how.fields:
+        by_mesh()
+    elif how.cost:
+        costs()
+    else:
+        by_seed(how)
+
+
+def made(size: float, degree: int = 3, names: tuple[str, ...] = tuple(TRUE)) -> ParametricTest:
+    """The model with elements of a size [mm] and polynomials of a degree."""
+    experiment = Experiment(SPECIMEN, strains=STRAINS, mesh_size=size)
+    return ParametricTest.meshed(experiment, names, degree)
+
+
+def finer_mesh(size: float, degree: int = 4) -> FinerMesh:
+    """What has the last word."""
+    fine = made(size, degree)
+    return FinerMesh(lambda values: fine.near(values, False), ERROR_RATIO)
+
+
+def by_mesh() -> None:
+    """Print what models of several meshes make of the states of a fine one."""
+    fine, (x, y) = made(0.15, 4), np.mgrid[-4.7:4.7:0.06, -4.2:4.2:0.06].reshape(2, -1)
+    states = fine.at(np.array([*list(TRUE.values())[:3], 0.0]), False)
+    points = np.column_stack([x, y])
+    hole = SPECIMEN.pitch * (np.round(points / SPECIMEN.pitch - 0.5) + 0.5)  # the nearest one
+    points = points[np.linalg.norm(points - hole, axis=1) > 0.5 * SPECIMEN.diameter + 0.02]
+    fields = [nodal_values(fine.mesh, s.displacement, points) for s in states]
+    forces = Readings(np.array([s.force for s in states]), 0.002)
+    print("| degree | elements [mm] | degree and elements of the finer mesh | modulus | exponent "
+          "| kappa | residual, last state [um] | seconds |")  # fmt: skip
+    print("|---" * 8 + "|")
+    for degree, size, finer in (
+        (2, 0.35, None), (2, 0.2, None), (2, 0.12, None), (3, 0.35, None), (3, 0.25, None),
+        (3, 0.35, (4, 0.25)), (3, 0.35, (4, 0.2)), (3, 0.25, (4, 0.2)),
+    ):  # fmt: skip
+        begin, model = time.process_time(), made(size, degree)
+        data = [FieldData(points, u, 5e-4, model.mesh) for u in fields]
+        last = None if finer is None else finer_mesh(finer[1], finer[0])
+        found = identify(model.near, data, UNKNOWNS, pixel_size=0.03, forces=forces, finer=last)
+        residual = 1e3 * found.state_equations[-1].residual
+        # The last word itself, not what is extrapolated from it.
+        row = (f"{v:.4g}" for v in (*(found.values - found.mesh_error)[:3], residual))
+        seconds = time.process_time() - begin
+        print("|", degree, "|", size, "|", finer or "", "|", " | ".join(row), "|",
+              f"{seconds:.0f} |", flush=True)  # fmt: skip
+
+
+def costs() -> None:
+    """Print seconds of processor time and factorisations for the states of two specimens."""
+    paper = Experiment(strains=(0.078, 0.11, 0.128), mesh_size=0.4)
+    small = Experiment(SPECIMEN, strains=(0.06, 0.09, 0.12), mesh_size=0.35)
+    names = ("moduli[0]", "exponents[0]", "kappa", "tilt", "travel")
+    true, other = np.array([1.2, 3.0, 5.4, 0.01, 1.0]), np.array([1.22, 2.9, 5.5, 0.012, 1.001])
+    print("| specimen | displacements | states | with derivatives | factorisations |")
+    print("|---" * 5 + "|")
+    for kind, experiment in (("4 x 4", small), ("6 x 10", paper)):
+        model = ParametricTest.meshed(experiment, names)
+        model.at(true)
+        for what, find in (("whole path", model.at), ("nearby", model.near)):
+            seconds = []
+            for wanted in (False, True):
+                model.at(true)
+                count, begin = model.structure.factorisations, time.process_time()
+                find(other, wanted)
+                seconds.append(time.process_time() - begin)
+                count = model.structure.factorisations - count
+            plain, full = seconds
+            print(f"| {kind}, {what} | {model.unknowns} | {plain:.2f} s | {full:.2f} s, "
+                  f"{full / plain:.2f} times | {count} |", flush=True)  # fmt: skip
+
+
+def by_seed(how: argparse.Namespace) -> None:
+    """Print bias, scatter and coverage over seeds."""
+    here = str(Path(__file__).parent)  # where workers find FUNCTION
+    os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
+    twin = f"twin-{how.twin_mesh:g}-{how.pixel_size:g}"
+    make_twin(how.folder / twin, how.twin_mesh, how.pixel_size)
+    base = {"mesh": how.mesh, "finer": how.finer_mesh, "twin": twin}
+    base["methods"] = [IMAGES, WHOLE, SUBSETS] if how.compare else [IMAGES]
+    cases = tuple({**base, "seed": seed} for seed in range(how.seeds))
+    campaign = Campaign(FUNCTION, cases, how.folder.resolve())
+    done = campaign.run(Workers(how.workers), lambda d, n, what: print(f"{d}/{n}", end="\r"))
+    for error in sorted(set(done["error"]) - {""}):
+        print(f"{int((done['error'] == error).sum())} failed: {error}")
+    done = done[done["error"] == ""]
+    print("| from | parameter | mean | bias [%] | scatter [%] | bias [standard errors] | scatter "
+          "[standard errors] | within 95 % by noise | with model error | largest error [%] |"
+          )  # fmt: skip
+    print("|---" * 10 + "|")
+    for method in base["methods"]:
+        for name, true in TRUE.items():
+            print(row_of(done, method, name, true))
+    print(f"\n{len(done)} seeds; {done['seconds'].mean():.1f} s of processor and "
+          f"{done['evaluations'].mean():.1f} evaluations of the model for a seed; outcomes "
+          f"{sorted(set(done['outcome']))}")  # fmt: skip
+
+
+def row_of(done: pd.DataFrame, method: str, name: str, true: float) -> str:
+    """A line of the table."""
+    value, sd, full = (np.array(done[f"{method} {name} {w}"]) for w in ("value", "sd", "full"))
+    off, z = value - true, (value - true) / sd
+    within = [100.0 * np.mean(abs(off) < 1.959964 * s) for s in (sd, full)]
+    return (
+        f"| {method} | `{name}` | {value.mean():.5g} | {100 * off.mean() / true:+.2f} | "
+        f"{100 * off.std(ddof=1) / true:.2f} | {z.mean():+.2f} | {z.std(ddof=1):.2f} | "
+        f"{within[0]:.0f} % | {within[1]:.0f} % | {100 * abs(off).max() / true:.2f} |"
+    )
+
+
+def make_twin(folder: Path, size: float, pixel_size: float) -> None:
+    """Images without noise, and exact forces, of the true test; once."""
+    if (folder / "forces.json").exists():
+        return
+    twin = made(size, 4)
+    states = twin.at(np.array(list(TRUE.values())), False)
+    snapshots = tuple(
+        Snapshot(e, s.displacement, s.force, branch=s.branch)
+        for e, s in zip(STRAINS, states, strict=True)
+    )
+    spec = ImagingSpec(pixel_size=pixel_size, margin_px=12)
+    make_images(Solution(twin.mesh, snapshots, {}), spec, folder, STRAINS)
+    write_json(folder / "forces.json", [s.force for s in states])
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all seeds of a campaign have in common."""
+
+    images: ImageSet
+    forces: FloatArray
+    model: ParametricTest
+    finer: FinerMesh
+    pixels: MeshPixels
+
+
+@cache
+def setting(twin: Path, mesh: float, finer: float) -> Setting:
+    """Made once in a worker."""
+    model = made(mesh)
+    return Setting(
+        ImageSet.read(twin), np.array(read_json(twin / "forces.json")), model,
+        finer_mesh(finer), MeshPixels(model.mesh),
+    )  # fmt: skip
+
+
+def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """What is identified from the images and readings of one seed, by each method."""
+    known = setting(folder / case["twin"], case["mesh"], case["finer"])
+    images, rng = known.images, np.random.default_rng(case["seed"])
+    exact = (images.reference(), *(images.deformed(e) for e in STRAINS))
+    f, *deformed = (i + rng.normal(0.0, NOISE, i.shape) for i in exact)
+    force_sd = FORCE_NOISE * float(known.forces.max())
+    readings = known.forces + rng.normal(0.0, force_sd, len(known.forces))
+    forces = Readings(readings, force_sd)
+    pairs = [images.pair(e).with_images(f, g) for e, g in zip(STRAINS, deformed, strict=True)]
+    row: dict[str, Any] = {}
+    for method in case["methods"]:
+        begin = time.process_time()
+        if method == IMAGES:
+            plain = (ImagePair(f, g, images.grid) for g in deformed)
+            data = [ImageData(pair, known.pixels, ImageNoise(NOISE, NOISE)) for pair in plain]
+        else:
+            measure = whole if method == WHOLE else by_subsets
+            measured = (measure(pair) for pair in pairs)
+            data = [FieldData(x, u, sd, known.model.mesh) for x, u, sd in measured]
+        found = identify(
+            known.model.near, data, UNKNOWNS, pixel_size=images.grid.pixel_size, forces=forces,
+            finer=known.finer,
+        )  # fmt: skip
+        parts = zip(TRUE, found.values, found.sd, found.sd_with_model_error, strict=True)
+        for name, *numbers in parts:
+            for what, number in zip(("value", "sd", "full"), numbers, strict=True):
+                row[f"{method} {name} {what}"] = float(number)
+        if method == IMAGES:
+            row["seconds"] = time.process_time() - begin
+            row["evaluations"], row["outcome"] = found.evaluations, found.minimum.outcome.value
+    return row
+
+
+def whole(pair: ImagePair) -> tuple[FloatArray, FloatArray, float]:
+    """Nodes, whole displacement there, and its standard deviation by noise, rms [mm]."""
+    assert pair.truth is not None
+    ansatz = Ansatz.of_specimen(SPECIMEN, options=AnsatzOptions(4, 3))
+    guess, u = ansatz.initial_guess(pair.strain), pair.truth.displacement
+    found = measure_displacement(pair, fit_displacement(u, pair.grid, ansatz, guess, pair.mask))
+    sd = float(np.sqrt(np.mean(found.noise_deviation**2)))
+    return found.mesh.nodes, found.displacement, sd
+
+
+def by_subsets(pair: ImagePair) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same by pyvale: subsets of material alone, weighted by their predicted errors."""
+    field = subset_field(pair, SUBSET)
+    assert field.sd is not None
+    return np.stack([field.x, field.y], 1)[field.good], field.u[field.good], field.sd[field.good]
+
+
+if __name__ == "__main__":
+    main()
