@@ -239,11 +239,11 @@ def test_statements_name_what_the_data_do_not_determine() -> None:
 
 def test_a_combination_of_many_parameters_has_words_too() -> None:
     """Holes all alike, and each by itself: 17 components of a unit vector, none of them large."""
-    names = ["all", *(f"hole {k}" for k in range(16))]
+    names = ["holes.diameter[0,0]", *(f"holes[{k}].diameter" for k in range(16))]
     design = np.hstack([np.ones((16, 1)), np.eye(16)])
     (text,) = undetermined_combinations(names, 1e6 * design.T @ design, [1.0] * 17)
-    assert text.startswith("all and hole 0 and hole 1 and")
-    assert text.endswith("together (nothing determines it)")
+    assert text.startswith("holes.diameter[0,0] and holes[0].diameter and holes[1].diameter and")
+    assert "(nothing determines it): leave one of them out, give it a prior_sd, or add" in text
 
 
 def test_a_wrong_model_widens_the_intervals() -> None:

@@ -12,6 +12,8 @@ _LARGE = 0.2
 """Relative standard deviation of a combination of parameters beyond which words say so."""
 _PART = 0.3
 """Of an eigenvector's largest component: which parameters a combination is of."""
+_GEOMETRY = ": leave one of them out, give it a prior_sd, or add a state nearer to buckling"
+"""What helps holes and edges, whose names have a dot."""
 
 
 def undetermined_combinations(
@@ -21,7 +23,7 @@ def undetermined_combinations(
 
     normal_matrix : (k, k) of the cost in natural weights: the inverse of the covariance.
     scales : what changes of each parameter are compared with.
-    remedy : what the words end with.
+    remedy : what the words end with, unless a hole or an edge is in the combination.
     """
     squares, vectors = np.linalg.eigh(normal_matrix * np.outer(scales, scales))
     with np.errstate(divide="ignore"):
@@ -32,14 +34,15 @@ def undetermined_combinations(
             continue
         own = [k for k in np.argsort(-abs(vector)) if abs(vector[k]) > _PART * max(abs(vector))]
         vector = vector * np.sign(vector[own[0]])
+        hint = _GEOMETRY if any("." in names[k] for k in own) else remedy
         how = "nothing determines it" if size > 1e3 else f"known to {100 * size:.2g} %"
         if len(own) == 1:
-            found.append(f"{names[own[0]]} is hardly determined ({how}){remedy}")
+            found.append(f"{names[own[0]]} is hardly determined ({how}){hint}")
             continue
         parts = ", ".join(f"{vector[k]:+.2f} {names[k]}" for k in own)
         found.append(
             f"{' and '.join(names[k] for k in sorted(own))} are determined only in other "
-            f"combinations than their relative changes ({parts}) together ({how}){remedy}"
+            f"combinations than their relative changes ({parts}) together ({how}){hint}"
         )
     return found
 
