@@ -222,6 +222,23 @@ def test_parameters_are_identified_from_a_state_beside_the_bifurcation() -> None
     assert found.states[1].strain == pytest.approx(strains[1], abs=5e-5)
 
 
+def test_holes_are_identified_from_displacements_at_points() -> None:
+    """Which lie where they lie, whatever the model's nodes do."""
+    names, exact = ("kappa", "holes.diameter[0,0]", "holes[5].x"), np.array([5.4, 0.03, -0.012])
+    test, sd = made((BEFORE,), names, FINER), 1e-3
+    (true,) = test.at(exact, with_derivatives=False)
+    points = true.mesh.nodes[true.mesh.cells].mean(axis=1)
+    u = displacement_at(true, points) + np.random.default_rng(0).normal(0.0, sd, points.shape)
+    unknowns = {
+        "kappa": Unknown(4.0, (0.5, 100.0)),
+        **{name: Unknown(0.0, (-0.08, 0.08)) for name in names[1:]},
+    }
+    found = identify(test.near, [FieldData(points, u, sd, FINER)], unknowns, pixel_size=0.03)
+    assert np.all(np.abs(found.values - exact) < 4.0 * found.sd)
+    assert np.all(found.sd[1:] < 3e-3)
+    assert found.state_equations[0].residual == pytest.approx(sd, rel=0.05)
+
+
 def test_what_it_is_not_made_for() -> None:
     with pytest.raises(InputError, match=r"expected some of .*'kappa'.*'tilt'.*got 'mu'"):
         made((BEFORE,), ("mu",))
