@@ -29,11 +29,11 @@ from modeharvest.fem.path.parameters import PARTS, holes_of
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.specimen import Imperfection, Specimen
 from modeharvest.idic.finite_element.identify import FinerMesh, Readings, Unknown, identify
+from modeharvest.idic.finite_element.model_error import corrections
 from modeharvest.idic.finite_element.observed import FieldData, ImageData
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.solver.noise import ImageNoise
-from modeharvest.idic.uncertainty.model_error import corrections
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec

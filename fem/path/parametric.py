@@ -29,10 +29,12 @@ from modeharvest.fem.path.factor import BodyFactor
 from modeharvest.fem.path.newton import Constraint
 from modeharvest.fem.path.parameters import TILT, TRAVEL, holes_of, parameter, require_open
 from modeharvest.fem.path.sensitivity import (
+    OMITTED,
     Sensitivity,
     Variation,
     amplitude_sensitivity,
     sensitivities,
+    with_omitted_terms,
 )
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -101,7 +103,7 @@ class ParametricTest:
         comm = MPI.COMM_SELF
         self.structure = Structure(mesh, experiment.material, loading, comm, True, degree)
         self.experiment, self.names, self.mesh = experiment, tuple(names), self.structure.shown
-        self._nodes = mesh.nodes
+        self._nodes, self._degree = mesh.nodes, degree
         self._parameters = {name: parameter(name, experiment) for name in (*names, TILT)}
         self._variations = {name: self._variation(name) for name in self._parameters}
         self._follower = PathFollower(self.structure, experiment.path)
@@ -208,6 +210,17 @@ class ParametricTest:
         """Of the equilibrium found last."""
         near = self._follower.linearisation
         return None if near is None else near.factor
+
+    def omitted_terms(self, values: FloatArray) -> list[ParametricState]:
+        """The states, with derivatives by OMITTED constants of the law alone."""
+        k, law = len(values), with_omitted_terms(self.experiment.material)
+        wider = replace(self.experiment, material=law)
+        test = ParametricTest.meshed(wider, [*self.names, *OMITTED], self._degree)
+        return [
+            replace(s, displacement_by=s.displacement_by[k:], nodes_by=s.nodes_by[k:],
+                    force_by=s.force_by[k:], strain_by=s.strain_by[k:])
+            for s in test.at(np.append(values, np.zeros(len(OMITTED))))
+        ]  # fmt: skip
 
     def _variation(self, name: str) -> Variation:
         """How the structure changes with a parameter."""

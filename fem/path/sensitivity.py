@@ -12,11 +12,14 @@ block elimination (Keller, in: Applications of Bifurcation Theory, Academic Pres
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
+from modeharvest.fem.materials import Material, functions_of
 from modeharvest.fem.path.continuation import State
 from modeharvest.fem.path.equilibrium import Structure
 from modeharvest.fem.path.factor import BodyFactor
@@ -24,6 +27,7 @@ from modeharvest.util.arrays import FloatArray
 
 _STEP = 1e-4  # of a constant, for differences
 _STEP_MM = 3e-5  # of the largest motion of a node
+OMITTED = ("omitted[0]", "omitted[1]", "omitted[2]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,3 +143,23 @@ def _change_of_forces(
     else:
         constant.value = value
     return total, prescribed
+
+
+def with_omitted_terms(material: Material) -> Material:
+    """The same law with OMITTED constants of 0, factors of terms that its energy may lack [MPa].
+
+    E^2, E (J - 1) and (J - 1)^3 with E = I1 - 3 - 2 ln J: the lowest isotropic ones that have
+    neither stress nor stiffness at rest.
+    """
+    kind = type(material)
+
+    def energy(law: Any, F: Any) -> Any:
+        functions, (a, b, c) = functions_of(F), law.omitted
+        J = functions.det(F)
+        E, v = functions.inner(F, F) - 2.0 - 2.0 * functions.ln(J), J - 1.0
+        return kind.energy(law, F) + a * E**2 + b * E * v + c * v**3
+
+    law = copy(material)
+    object.__setattr__(law, "__class__", type(kind.__name__, (kind,), {"energy": energy}))
+    object.__setattr__(law, "omitted", (0.0,) * len(OMITTED))
+    return law

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from modeharvest.idic.finite_element.model_error import ScoreTest, in_words, joint_score
 from modeharvest.idic.finite_element.observed import (
     ImageData,
     StateEquations,
@@ -21,11 +23,9 @@ from modeharvest.idic.finite_element.observed import (
     at_fixed_points,
     displacement_at,
 )
-from modeharvest.idic.finite_element.score import Scalar, joint_score
 from modeharvest.idic.solver.assembly import NormalEquations
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, minimise
 from modeharvest.idic.solver.pyramid import FULL, Level
-from modeharvest.idic.uncertainty.model_error import ScoreTest, score_test
 from modeharvest.idic.uncertainty.parameters import undetermined_combinations
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -116,13 +116,13 @@ class Identified:
     mesh_error: FloatArray
     """(k,) taken for what the finer mesh leaves, and added to the values: from how far it moved
     them and the ratio of errors; 0 where there was no finer mesh."""
-    extrapolated: list[ModelState]
-    scalars: list[Scalar]
-    """States with elements of no size as the finer mesh lets expect them; residuals of forces,
-    strains and priors, with what the mesh makes of them."""
+    equations: list[Callable[[], NormalEquations]]
+    """By the data as they are prepared: at the states, and at those with elements of no size."""
     forces: Readings | None = None
     model_error: ScoreTest | None = None
-    """Whether the model can be right, where corrections were given to test it with."""
+    law_error: ScoreTest | None = None
+    """Whether the model can be right, by corrections that know no law, and whether its law can, by
+    terms of the energy that it may lack; where they were given to test it with."""
 
     @property
     def sd(self) -> FloatArray:
@@ -147,10 +147,33 @@ class Identified:
         variance = np.einsum("sj,jk,sk->s", J, self.covariance_with_model_error, J)
         return np.asarray(np.sqrt(variance))
 
+    def log_evidence(self) -> tuple[float, float]:
+        """Logarithm of the evidence but for what all models share; what of it comes by the mesh.
+
+        Marginal likelihood by Laplace's method, unknowns without a prior uniform within bounds:
+        MacKay, Neural Comput. 4 (1992) 415-447, doi 10.1162/neco.1992.4.3.415. Of several models
+        comparable after all have been identified, by the same prepared data.
+        """
+        H, costs = self.minimum.equations.matrix, list[float]()
+        for at in (equations() for equations in self.equations):
+            # Unknowns would move to where the cost of these states is least.
+            costs.append(at.cost - 0.5 * float(at.gradient @ ScaledEigen.of(H).solve(at.gradient)))
+        unknowns = self.unknowns.values()
+        sizes = [u.prior_sd or float(np.ptp(u.bounds)) / np.sqrt(2.0 * np.pi) for u in unknowns]
+        # An unknown that nothing determines has its bounds' width, and costs nothing.
+        bounded = np.diag([float(u.prior_sd is None) for u in unknowns])
+        occam = 0.5 * float(np.linalg.slogdet(H * np.outer(sizes, sizes) + bounded)[1])
+        return -costs[1] - occam, costs[0] - costs[1]
+
+    @property
+    def is_unlike(self) -> bool:
+        """Whether a state's residual is far above its noise."""
+        return any(part.residual > _UNLIKE * part.expected for part in self.state_equations)
+
     @property
     def statements(self) -> tuple[str, ...]:
         """What the data don't determine, and which unknowns are at their bounds, in words."""
-        scales, found = list[float](), [] if self.model_error is None else [str(self.model_error)]
+        scales, found = list[float](), in_words(self.model_error, self.law_error)
         for (name, unknown), value in zip(self.unknowns.items(), self.values, strict=True):
             scales.append(unknown.scale(value))
             low, high = unknown.bounds
@@ -275,6 +298,7 @@ def identify(
     levels: Sequence[Level] = LEVELS,
     finer: FinerMesh | None = None,
     corrections: FloatArray | None = None,
+    omitted: Model | None = None,
     progress: Progress = silent,
 ) -> Identified:
     """Find the unknowns for which a model's states look like the data.
@@ -288,6 +312,8 @@ def identify(
         both the values are extrapolated to no error (Richardson).
     corrections : (j, n, 2) of each state's nodal displacements that no law bounds [-], by which the
         model is tested.
+    omitted : the states with derivatives by further parameters alone, which are 0 in the model:
+        factors of terms that its law may lack, by which the law is tested.
     InputError if the model has no states at the start.
     """
     if not any(data) and forces is None:
@@ -314,7 +340,7 @@ def identify(
         factor = finer.error_ratio / (1.0 - finer.error_ratio)
     off = (values - begin) * factor
     found = replace(found, unknowns=values)
-    result = _assessed(cost, states, found, off, factor, corrections)
+    result = _assessed(cost, states, found, off, factor, corrections, omitted)
     return replace(result, values=values + off)
 
 
@@ -341,7 +367,7 @@ def _finished(
 
 def _assessed(
     cost: _Cost, states: list[ModelState], found: Minimum, off: FloatArray, factor: float,
-    corrections: FloatArray | None,
+    corrections: FloatArray | None, omitted: Model | None,
 ) -> Identified:  # fmt: skip
     """The result: covariances by noise and by the residual from block to block, test of the model.
 
@@ -352,62 +378,36 @@ def _assessed(
     inverse = ScaledEigen.of(found.equations.matrix).inverse()
     known = np.isfinite(np.diag(inverse))
     half = np.where(np.outer(known, known), inverse, 0.0)
-    coarse, shares = cost.states(values), cost.state_equations(states)
+    shares, k = cost.state_equations(states), len(values)
     # Of parts of the body: noise of the reference and errors of the model are in all states.
-    blocks = np.zeros((max([len(s.blocks) for s in shares], default=0), len(values)))
+    blocks = np.zeros((max([len(s.blocks) for s in shares], default=0), k))
     for share in shares:
         blocks[: len(share.blocks)] += share.blocks
-    scatter, scalars = blocks.T @ blocks, []
-    for (r, J), (r_coarse, _) in zip(
-        cost.scalars(states, values), cost.scalars(coarse, values), strict=True
-    ):
-        scatter += max(1.0, r**2) * np.outer(J, J)
-        scalars.append(Scalar(r, J, factor * (r - r_coarse)))
-    by_mesh = [
-        factor * (s.displacement - c.displacement) for s, c in zip(states, coarse, strict=True)
-    ]
     limit = [
-        replace(s, displacement=s.displacement + e) for s, e in zip(states, by_mesh, strict=True)
-    ]
+        replace(s, displacement=s.displacement + factor * (s.displacement - c.displacement),
+                force=s.force + factor * (s.force - c.force))
+        for s, c in zip(states, cost.states(values), strict=True)
+    ]  # fmt: skip
+    wider = states if omitted is None else [
+        replace(state, **{
+            name: np.concatenate([getattr(state, name), getattr(row, name)])
+            for name in ("displacement_by", "force_by", "strain_by")
+        }) for state, row in zip(states, omitted(values), strict=True)
+    ]  # fmt: skip
+    scalars, expected = (cost.scalars(each, values) for each in (wider, limit))
+    phi = np.zeros((0, *states[0].displacement.shape)) if corrections is None else corrections
     readings = 0 if cost.forces is None else int(np.isfinite(cost.forces.values).sum())
-    joint = joint_score(cost.data, states, scalars, by_mesh, corrections, readings)
-    own = slice(len(values))
-    test = None
-    if corrections is not None:
-        test = score_test(*joint, len(values), (corrections**2).sum(axis=2).mean(axis=1))
-    matrices = half @ joint.noise[own, own] @ half, half @ scatter @ half
+    joint = joint_score(cost.data, wider, limit, scalars, expected, phi, readings)
+    terms, n = len(wider[0].displacement_by), len(joint.score)
+    scatter = blocks.T @ blocks
+    for r, J in scalars:
+        scatter += max(1.0, r**2) * np.outer(J[:k], J[:k])
+    matrices = half @ joint.noise[:k, :k] @ half, half @ scatter @ half
     for matrix in matrices:
         matrix[~known, ~known] = np.inf
     return Identified(
-        cost.unknowns, values, *matrices, found, states, shares, cost.evaluations, off, limit,
-        scalars,        cost.forces, test,
+        cost.unknowns, values, *matrices, found, states, shares, cost.evaluations, off,
+        [partial(cost.equations_at, each, values) for each in (states, limit)], cost.forces,
+        joint.test(k, terms, n) if len(phi) else None,
+        joint.test(k, k, terms) if terms > k else None,
     )  # fmt: skip
-
-
-def log_evidence(found: Identified, data: Sequence[StateObservation | None]) -> tuple[float, float]:
-    """Logarithm of a model's evidence but for what all models share; of it by the mesh.
-
-    Marginal likelihood by Laplace's method, unknowns without a prior uniform within their bounds:
-    MacKay, Neural Comput. 4 (1992) 415-447, doi 10.1162/neco.1992.4.3.415. Comparable with the same
-    prepared data, so after all models have been identified. The second number is what came in by
-    extrapolating to elements of no size.
-    """
-    H, costs = found.minimum.equations.matrix, list[float]()
-    for states, share in ((found.states, 0.0), (found.extrapolated, 1.0)):
-        gradient: FloatArray = np.zeros(len(H))
-        squares = 0.0
-        for part, state in zip(data, states, strict=True):
-            if part is not None:
-                here = part.equations(state)
-                gradient, squares = gradient + here.blocks.sum(axis=0), squares + here.squares
-        for scalar in found.scalars:
-            r = scalar.residual + share * scalar.by_mesh
-            gradient, squares = gradient - r * scalar.slopes, squares + r**2
-        # Unknowns would move to where the cost of these states is least.
-        costs.append(0.5 * float(squares - gradient @ ScaledEigen.of(H).solve(gradient)))
-    unknowns = found.unknowns.values()
-    sizes = [u.prior_sd or float(np.ptp(u.bounds)) / np.sqrt(2.0 * np.pi) for u in unknowns]
-    # An unknown that nothing determines has its bounds' width, and costs nothing.
-    bounded = np.diag([float(u.prior_sd is None) for u in unknowns])
-    occam = 0.5 * float(np.linalg.slogdet(H * np.outer(sizes, sizes) + bounded)[1])
-    return -costs[1] - occam, costs[0] - costs[1]

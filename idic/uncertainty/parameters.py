@@ -52,13 +52,10 @@ _GRADES = ((10.0, "decisive"), (6.0, "strong"), (2.0, "positive"))
 Stat. Assoc. 90 (1995) 773-795, doi 10.1080/01621459.1995.10476572 ("very strong" there)."""
 
 
-def compared_by_evidence(
-    names: Sequence[str], evidence: Sequence[tuple[float, float]], rejected: Sequence[bool]
-) -> str:
+def compared_by_evidence(names: Sequence[str], evidence: Sequence[tuple[float, float]]) -> str:
     """Which of several models the data prefer, in words.
 
     evidence : logarithm of each, and what of it is by the mesh: the Bayes factor is as uncertain.
-    rejected : whether a test says of each that it is wrong.
     """
     values, by_mesh = np.array(evidence).T
     best, second = (int(k) for k in np.argsort(-values)[:2])
@@ -67,7 +64,5 @@ def compared_by_evidence(
     grade = next((word for limit, word in _GRADES if 2.0 * least > limit), None)
     factor = f"the logarithm of the Bayes factor is {difference:.3g}, {least:.3g} at least"
     if grade is None:
-        text = f"{names[best]} and {names[second]} are not distinguishable ({factor})"
-    else:
-        text = f"evidence for {names[best]} against {names[second]} is {grade} ({factor})"
-    return text + ("; but the test of model error rejects it, too" if rejected[best] else "")
+        return f"{names[best]} and {names[second]} are not distinguishable ({factor})"
+    return f"evidence for {names[best]} against {names[second]} is {grade} ({factor})"

@@ -30,6 +30,7 @@ from modeharvest.report.model import (
 )
 
 Summary = Mapping[str, Any]
+_TEST = "{chi_squared:.4g} of {degrees_of_freedom}, p = {p_value:.2g}"
 _HOLES_SHOWN = 0.15  # of a diameter: as which the largest change of a hole is drawn, about
 
 
@@ -51,8 +52,7 @@ def identification_report(
             for name, row in zip(names, summary["correlations"], strict=True)]  # fmt: skip
     correlations = ReportTable(**caption("table-identified-correlations"),
                                columns=["", *names], rows=rows)  # fmt: skip
-    laws = summary["laws"]
-    compared = [ReportTable.of("identified-laws", map(_law_row, laws))] if laws else []
+    laws = ReportTable.of("identified-laws", map(_law_row, summary["laws"]))
     states = ReportTable.of("identified-states", map(_state_row, summary["states"]))
     return Report(
         kind="identification",
@@ -70,7 +70,7 @@ def identification_report(
         sections=[
             Section.of("identified", [
                 *Card.tabular(table, wide=True), *Card.tabular(correlations),
-                *(card for each in compared for card in Card.tabular(each, wide=True)),
+                *(Card.tabular(laws, wide=True) if laws.rows else []),
                 *_hole_cards(summary),
             ]),
             Section.of("identified-states", [
@@ -103,19 +103,12 @@ def _row(p: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _law_row(law: Mapping[str, Any]) -> Mapping[str, Any]:
-    test = law["model_error"]
-    return {
-        "name": law["name"],
-        "evidence": f"{law['log_evidence']:.1f}",
-        "by_mesh": f"{law['log_evidence_by_mesh']:+.1f}",
-        "chi_squared": f"{test['chi_squared']:.4g}",
-        "degrees": test["degrees_of_freedom"],
-        "p_value": f"{test['p_value']:.2g}",
-        "parameters": ", ".join(
-            f"{p['name']} {Measured(p['value'], (p['sd_with_model_error'] or np.nan,))}"
-            for p in law["parameters"]
-        ),
-    }
+    values = [
+        f"{p['name']} {Measured(p['value'], (p['sd_with_model_error'] or np.nan,))}"
+        for p in law["parameters"]
+    ]
+    tests = {name: _TEST.format(**law[name]) for name in ("model_error", "law_error")}
+    return {**law, **tests, "parameters": ", ".join(values)}
 
 
 def _state_row(state: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -209,9 +209,8 @@ class IdentificationCase(CaseModel):
         own = vars(self.experiment.material)
         rest = {n: u for n, u in self.unknowns.items() if n.partition("[")[0] not in own}
         experiment = replace(self.experiment, material=law.material)
-        return self.model_copy(update={
-            "experiment": experiment, "unknowns": law.unknowns | rest, "laws": (),
-        })  # fmt: skip
+        update = {"experiment": experiment, "unknowns": law.unknowns | rest}
+        return self.model_copy(update=update)
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, materials by their kind."""

@@ -28,8 +28,8 @@ from modeharvest.idic.finite_element.identify import (
     Readings,
     Unknown,
     identify,
-    log_evidence,
 )
+from modeharvest.idic.finite_element.model_error import corrections
 from modeharvest.idic.finite_element.observed import (
     MOTION,
     PLACE,
@@ -44,7 +44,6 @@ from modeharvest.idic.local.field import read_field
 from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
-from modeharvest.idic.uncertainty.model_error import corrections
 from modeharvest.idic.uncertainty.parameters import compared_by_evidence
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.distortion.lens import undistorted
@@ -70,6 +69,7 @@ _DEGREE, _FINE_DEGREE = 3, 4
 """Of the polynomials over an element: of the model, and of the finer mesh and of twins."""
 _ERROR_RATIO = 0.06
 """Of the errors of these two: docs/identification.md, "Mesh"."""
+_OTHER = {"buckled+": "buckled-", "buckled-": "buckled+"}
 _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "fenics-dolfinx")
 
 
@@ -152,9 +152,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     def _identify(self) -> list[Path]:
         experiment = self.case.experiment
-        model = self._model(experiment, list(self.case.unknowns))
-        data, forces, px, frame = self._data(model.mesh)
-        found = self._identified(self.case, model, data, forces, px, frame)
+        data, forces, px, frame = self._data(self._model(experiment, []).mesh)
+        found, model, choices = self._best(self.case, data, forces, px, frame)
         laws, comparison = self._laws(found, data, forces, px, frame)
         mesh = found.states[0].mesh
         solution = Solution(mesh, tuple(
@@ -166,7 +165,9 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         solution.write(h5)
         solution.write_vtu(vtu)
         summary = self._summary(found, model)
-        summary |= to_plain({"laws": laws, "statements": [*found.statements, *comparison]})
+        summary |= to_plain({"laws": laws, "statements": [
+            *found.statements, *choices, *comparison,
+        ]})  # fmt: skip
         from modeharvest.report.identification import identification_report
         from modeharvest.report.model import write_page
 
@@ -174,12 +175,25 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         write_json(path, summary)
         return [h5, vtu, page, path]
 
+    def _best(self, case: IdentificationCase, *data: Any) -> tuple[Identified, Any, list[str]]:
+        """A case's unknowns, on the other branch if they fit better there, and the model."""
+        found, model = self._identified(case, *data)
+        named = case.experiment.branches[0]
+        if not (found.is_unlike and any(s.branch in _OTHER for s in found.states)):
+            return found, model, []
+        experiment = replace(case.experiment, branches=(_OTHER[named],))
+        other = self._identified(case.model_copy(update={"experiment": experiment}), *data)
+        if other[0].minimum.equations.cost > found.minimum.equations.cost:
+            return found, model, []
+        return *other, [f"the specimen is on {_OTHER[named]}: on {named} the model fits worse"]
+
     def _identified(
-        self, case: IdentificationCase, model: Any, data: list[StateObservation | None],
+        self, case: IdentificationCase, data: list[StateObservation | None],
         forces: Readings | None, px: float, frame: dict[str, Unknown],
-    ) -> Identified:  # fmt: skip
-        """A case's unknowns, and the camera's, by the data."""
+    ) -> tuple[Identified, Any]:  # fmt: skip
+        """A case's unknowns, and the camera's, by the data; and the model."""
         experiment, unknowns = case.experiment, case.unknowns
+        model = self._model(experiment, list(unknowns))
         size = self.case.finer_mesh_size or 0.7 * experiment.mesh_size
         fine = self._model(replace(experiment, mesh_size=size), list(unknowns), _FINE_DEGREE)
         has_place = any(name in PLACE for name in frame)
@@ -198,26 +212,23 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             strains=Readings(np.array(experiment.strains), strain_sd),
             finer=FinerMesh(lambda values: seen(fine, values, False), _ERROR_RATIO),
             corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
+            omitted=lambda values: model.omitted_terms(values[: len(unknowns)]),
             progress=self.progress,
-        )  # fmt: skip
+        ), model  # fmt: skip
 
     def _laws(self, found: Identified, *data: Any) -> tuple[list[dict[str, Any]], list[str]]:
         """The evidence for each of the case's materials, and which is the best, in words."""
         results = {type(self.case.experiment.material).__name__: found}
         for law in self.case.laws:
-            case = self.case.with_law(law)
-            model = self._model(case.experiment, list(case.unknowns))
-            results[law.name] = self._identified(case, model, *data)
+            results[law.name], _, _ = self._best(self.case.with_law(law), *data)
         if len(results) == 1:
             return [], []
-        # All by the same weights, those of the last.
-        evidence = [log_evidence(result, data[0]) for result in results.values()]
-        rejected = [bool(r.model_error and r.model_error.is_rejected) for r in results.values()]
-        text = compared_by_evidence(list(results), evidence, rejected)
+        evidence = [result.log_evidence() for result in results.values()]
+        text = compared_by_evidence(list(results), evidence)
         return [
             {"name": name, "log_evidence": log, "log_evidence_by_mesh": by_mesh,
-             "model_error": result.model_error, "outcome": result.minimum.outcome.value,
-             "parameters": [
+             "model_error": result.model_error, "law_error": result.law_error,
+             "outcome": result.minimum.outcome.value, "parameters": [
                  {"name": n, "value": value, "sd_with_model_error": sd} for n, value, sd
                  in zip(result.unknowns, result.values, result.sd_with_model_error, strict=True)
              ]}
@@ -352,6 +363,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "parameters": parameters,
             "correlations": found.correlations,
             "model_error": found.model_error,
+            "law_error": found.law_error,
             "outcome": found.minimum.outcome.value,
             "explanation": found.minimum.outcome.explanation,
             "critical_strain": model.critical_strain,
