@@ -348,6 +348,20 @@ def test_an_unstable_rve_does_not_hide_that_the_pattern_grows_before() -> None:
     assert (found.kind, found.negative_before, found.negative_after) == ("pattern", 0, 1)
 
 
+def test_a_critical_mode_that_is_not_of_v_alone_is_located_too() -> None:
+    """With what w does under shear as a second mode u takes part; one long step to behind it."""
+    about, one = RVE(cell(0.5), Ogden(), [PATTERN], JUNCTION), (-JUNCTION[0], -JUNCTION[1])
+    at = about.condensed(about.at_rest, np.zeros(about.cell.reduction.size))
+    sheared = about.cell.reduction.displacement(at.response[:, 1] + at.response[:, 2])
+    both = RVE(about.cell.cell, Ogden(), [PATTERN.moved(one), sheared])
+    body = HomogenizedBody.of_specimen(Specimen(), both, PlateLoading(), divisions=(3, 5))
+    path = HomogenizedPath(body, PathOptions(first_step=0.035))
+    assert path.follow_primary(0.128, "all")
+    found = path.critical()
+    assert found is not None
+    assert (found.kind, found.negative_before, found.negative_after) == ("pattern", 0, 1)
+
+
 def test_a_plate_s_force_is_the_derivative_of_the_energy() -> None:
     """In bending, shear and compression, on the buckled branch too."""
     for loading in (PlateLoading(), PlateLoading(0, 1), PlateLoading(0.5, 0, 1, plates="sliding")):

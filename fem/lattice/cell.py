@@ -81,17 +81,15 @@ class CondensedCell:
         cell: PeriodicCell,
         carriers: FloatArray,
         u: FloatArray,
-        constraints: FloatArray | None = None,
+        constraints: FloatArray,
         violation: FloatArray | float = 0.0,
     ) -> None:
         self._cell, self._carriers, self._u = cell, carriers, u
         self._constraints, self._violation = constraints, violation
         forces = cell.body.forces(u)
         self.macro_forces = carriers.T @ forces
-        self.forces = cell.reduction.restricted(forces)[cell.free_dofs]
-        self._all_forces = self.forces
-        if constraints is not None:
-            self.forces = self.forces - constraints.T @ (constraints @ self.forces)
+        self._all_forces = cell.reduction.restricted(forces)[cell.free_dofs]
+        self.forces = self._all_forces - constraints.T @ (constraints @ self._all_forces)
         self.is_regular = bool(np.isfinite(forces).all())
         if self.is_regular:
             self._condense()
@@ -106,16 +104,14 @@ class CondensedCell:
         except ArithmeticError:  # exactly singular
             self.is_regular = False
             return
-        known = [self._all_forces, coupling] if C is None else [self._all_forces, coupling, C.T]
-        solved = -factor.solve(np.column_stack(known))
-        self.negative = factor.negative_pivots
-        if C is not None:
-            solved, by_constraints = solved[:, : -len(C)], solved[:, -len(C) :]
-            size = C @ by_constraints  # negative definite where the constrained tangent is as K
-            missing = C @ solved
-            missing[:, 0] += self._violation
-            solved = solved - by_constraints @ np.linalg.solve(size, missing)
-            self.negative += int(np.sum(np.linalg.eigvalsh(0.5 * (size + size.T)) < 0)) - len(C)
+        known = np.column_stack([self._all_forces, coupling, C.T])
+        solved, by_constraints = np.hsplit(-factor.solve(known), [1 + coupling.shape[1]])
+        size = C @ by_constraints  # negative definite where the constrained tangent is as K
+        missing = C @ solved
+        missing[:, 0] += self._violation
+        solved = solved - by_constraints @ np.linalg.solve(size, missing)
+        turned = int(np.sum(np.linalg.eigvalsh(0.5 * (size + size.T)) > 0))
+        self.negative = factor.negative_pivots - turned
         self.relaxed, self.response = cell.every(solved[:, 0]), cell.every(solved[:, 1:])
         self.condensed = carriers.T @ self.on_carriers + coupling.T @ solved[:, 1:]
         self.relaxed_forces = self.macro_forces + coupling.T @ solved[:, 0]
@@ -136,7 +132,8 @@ class LinearisedCell(CondensedCell):
         self.loading, self.load, self.amplitude = loading, load, amplitude
         self.gradient, self.fluctuation, self.area = gradient, fluctuation, cell.cell.area
         Q = loading.axes  # along which components are, F̄'s among them
-        super().__init__(cell, cell.affine @ Q, cell.displaced(Q @ gradient, fluctuation))
+        none = np.zeros((0, int(cell.free_dofs.sum())))
+        super().__init__(cell, cell.affine @ Q, cell.displaced(Q @ gradient, fluctuation), none)
         if self.is_regular:
             free, self.rate = loading.free, loading.rate
             self.rate[free] = np.linalg.solve(

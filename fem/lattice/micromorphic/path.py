@@ -211,10 +211,14 @@ class HomogenizedPath:
         known, calm = {state.load: state for state in ends}, ends[0].rve_negative
 
         def at(load: float) -> HomogenizedState:
-            # Not from states so near to a singular one that rounding moves their v.
-            far = [e for e in known if abs(e - load) > 100 * tolerance or e == load]
-            near = [known[e] for e in sorted(far or known, key=lambda e: -abs(e - load))]
-            found = self.equilibrium(load, _expected(near, load))
+            # Not from states so near to a singular one that rounding moves their v, nor two so near
+            # to each other.
+            far, near = 100 * tolerance, list[float]()
+            for e in sorted(known, key=lambda e: abs(e - load)):
+                if e == load or all(abs(e - other) > far for other in (load, *near)):
+                    near.append(e)
+            states = [known[e] for e in near[1::-1]] or [ends[0]]
+            found = self.equilibrium(load, _expected(states, load))
             if found is None:
                 raise ArithmeticError(f"no equilibrium at the load {load}")
             known[load] = found

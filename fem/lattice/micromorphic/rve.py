@@ -99,7 +99,7 @@ class RVE:
         patterns = np.concatenate([shapes, along]).reshape(3 * len(modes), X.size)
         self.carriers = np.column_stack([self.cell.affine, patterns.T])
         """(2 n, 4 + 3 m) nodal displacements [mm] of generalised strains of 1."""
-        self._constraints = self._independent() if len(modes) else None
+        self._constraints = self._independent()
 
     @property
     def at_rest(self) -> FloatArray:
@@ -113,9 +113,7 @@ class RVE:
 
     def condensed(self, strains: FloatArray, fluctuation: FloatArray) -> CondensedCell:
         """The equations at strains q (4 + 3 m,) and w (2 count,) of the masters, w condensed."""
-        violation: FloatArray | float = 0.0
-        if self._constraints is not None:
-            violation = self._constraints @ fluctuation[self.cell.free_dofs]
+        violation = self._constraints @ fluctuation[self.cell.free_dofs]
         u = self._carried(strains) + self.cell.reduction.displacement(fluctuation)
         return CondensedCell(self.cell, self.carriers, u, self._constraints, violation)
 
@@ -212,7 +210,7 @@ class RVE:
         reduced = self.cell.reduction.restricted(self._weights())
         rows, size = np.linalg.qr(reduced[self.cell.free_dofs])
         diagonal = np.abs(np.diag(size))
-        if not diagonal.min() > _DEPENDENT * diagonal.max():
+        if not (diagonal > _DEPENDENT * diagonal.max(initial=0.0)).all():
             what = "modes: expected phi_i and phi_i X to be linearly independent on the cell"
             raise InputError(
                 f"{what}, got such that are not; leave modes out or take a larger cell"
