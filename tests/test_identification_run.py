@@ -303,6 +303,10 @@ def test_the_shipped_case_is_one() -> None:
         ({"data": {"reference": "f.tif", "deformed": ["g.tif", "h.tif"], "pixel_size": 0.1,
                    "light_degree": 9}}, "data: expected light_degree of 0 to 6, got 9"),
         ({"twin": None}, "expected a table [data] or a table [twin]"),
+        ({"laws": [{"name": "Ogden", "material": {"kind": "ogden"}, "unknowns": {}}]},
+         "laws: expected names that differ, got ['Ogden', 'Ogden']"),
+        ({"laws": [{"name": "a", "material": {"kind": "foam"}, "unknowns": {}}]},
+         "expected a laws.material kind among ['ogden', 'two-term-I1'], got 'foam'"),
     ],
 )  # fmt: skip
 def test_a_case_that_makes_no_sense_is_refused_in_one_line(

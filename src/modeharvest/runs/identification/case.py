@@ -191,6 +191,9 @@ class IdentificationCase(CaseModel):
             require_within(what, self.finer_mesh_size, 0.0, most, above=True)
         if not self.unknowns:
             raise InputError("unknowns: expected at least one, got none")
+        names = [type(self.experiment.material).__name__, *(law.name for law in self.laws)]
+        if len(set(names)) < len(names):
+            raise InputError(f"laws: expected names that differ, got {names}")
         for name in (*self.unknowns, *(self.twin.values if self.twin is not None else ())):
             parameter(name, self.experiment)
         if (self.data is None) == (self.twin is None):

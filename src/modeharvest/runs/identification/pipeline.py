@@ -250,7 +250,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         start = {f"{name}[{k}]": 0.0 for k in range(count) for name in MOTION}
         if data.fields:
             assert data.field_sd_mm is not None
-            fields = [read_field(path, y_axis=data.y_axis) for path in self._files]
+            fields = [read_field(path, units="mm", y_axis=data.y_axis) for path in self._files]
             found: list[Any] = [
                 FieldData(f.points[f.good], f.u[f.good], data.field_sd_mm, mesh) for f in fields
             ]
