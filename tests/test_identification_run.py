@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.report.identification import identification_report
 from modeharvest.runs.case import Case
 from modeharvest.runs.identification.case import IdentificationCase
-from modeharvest.runs.identification.pipeline import run_identification
+from modeharvest.runs.identification.pipeline import _path_warnings, run_identification
 from modeharvest.util.errors import InputError
 
 SPECIMEN = {"holes_x": 4, "holes_y": 2, "diameter": 1.5, "bulk_x": 0.9, "bulk_y": 0.4}
@@ -340,3 +341,19 @@ def test_images_of_another_number_are_refused(tmp_path: Path) -> None:
         case._base = tmp_path
         with pytest.raises(InputError, match=rf"as many {what} as strains \(2\), got 1"):
             run_identification(case, tmp_path / "out")
+
+
+def test_states_that_are_not_those_of_the_whole_path_are_warned_of() -> None:
+    def ends_at(u: float) -> list[SimpleNamespace]:
+        return [SimpleNamespace(displacement=np.full((3, 2), u))]
+
+    def lost(values: object, with_derivatives: bool) -> list[SimpleNamespace]:
+        raise InputError("expected an equilibrium, got none")
+
+    near, same, other = (lambda *_, u=u: ends_at(u) for u in (0.1, 0.1 + 1e-7, 0.3))
+    none = np.zeros(0)
+    assert _path_warnings(SimpleNamespace(near=near, at=same), none) == []
+    (text,) = _path_warnings(SimpleNamespace(near=near, at=other), none)
+    assert "up to 0.2 mm off those that the whole path" in text
+    (text,) = _path_warnings(SimpleNamespace(near=near, at=lost), none)
+    assert text.endswith("along the whole path: expected an equilibrium, got none")

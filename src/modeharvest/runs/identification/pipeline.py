@@ -70,6 +70,8 @@ _DEGREE, _FINE_DEGREE = 3, 4
 _ERROR_RATIO = 0.06
 """Of the errors of these two: docs/identification.md, "Mesh"."""
 _OTHER = {"buckled+": "buckled-", "buckled-": "buckled+"}
+_SAME_MM = 1e-5
+"""By which states found step by step and along the whole path may differ."""
 _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "fenics-dolfinx")
 
 
@@ -164,7 +166,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         h5, vtu, page, path = (self.folder / name for name in names)
         solution.write(h5)
         solution.write_vtu(vtu)
-        summary = self._summary(found, model)
+        warnings = _path_warnings(model, found.minimum.unknowns[: len(model.names)])
+        summary = self._summary(found, model) | {"warnings": warnings}
         summary |= to_plain({"laws": laws, "statements": [
             *found.statements, *choices, *comparison,
         ]})  # fmt: skip
@@ -372,10 +375,26 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "force_sd_N_per_mm": None if forces is None else forces.sd,
             "evaluations": found.evaluations,
             "model_unknowns": model.unknowns,
-            "warnings": [],
             "case": case.plain(),
             "versions": versions(*_LIBRARIES),
         }))  # fmt: skip
+
+
+def _path_warnings(model: Any, values: FloatArray) -> list[str]:
+    """Follow the whole path to states that were found step by step; what is wrong with them."""
+    near = model.near(values, False)
+    try:
+        whole = model.at(values, False)
+    except InputError as error:
+        return [f"The states were found step by step; along the whole path: {error}"]
+    pairs = zip(near, whole, strict=True)
+    off = max(float(np.abs(a.displacement - b.displacement).max()) for a, b in pairs)
+    if off < _SAME_MM:
+        return []
+    return [
+        f"The states were found step by step, and are up to {off:.2g} mm off those that the whole "
+        "path of the same parameters leads to: they may be on another branch."
+    ]
 
 
 def run_identification(
