@@ -273,10 +273,9 @@ class Imbalance:
         self.mesh, self.material = mesh, material
         local, x = shape_gradients("T6", _QUADRATURE), mesh.nodes[mesh.cells]
         F = np.einsum("eki,qkj->eqij", x, local)
-        self._slopes = np.einsum("qkj,eqji->eqki", local, np.linalg.inv(F))
-        self._weights = np.linalg.det(F) / 6.0
-        free = np.repeat(~loaded, 2).astype(float)
-        self._free = csr_array(diags_array(free))
+        self.slopes = np.einsum("qkj,eqji->eqki", local, np.linalg.inv(F))
+        self.weights = np.linalg.det(F) / 6.0
+        self._free = csr_array(diags_array(np.repeat(~loaded, 2).astype(float)))
         dofs = (2 * mesh.cells[:, :, None] + np.arange(2)).reshape(len(mesh.cells), 12)
         self._rows, self._cols = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, 12).ravel()
         self._dofs = dofs.ravel()
@@ -284,15 +283,15 @@ class Imbalance:
     def forces(self, u: FloatArray) -> tuple[FloatArray, csr_array]:
         """(2 n,) internal forces at u (2 n,) and their derivatives (2 n, 2 n), up to a factor."""
         cells = self.mesh.cells
-        F = np.eye(2) + np.einsum("eai,eqaj->eqij", u.reshape(-1, 2)[cells], self._slopes)
+        F = np.eye(2) + np.einsum("eai,eqaj->eqij", u.reshape(-1, 2)[cells], self.slopes)
         there = np.linalg.det(F) > _LEAST_DET
         F[~there] = np.eye(2)
         P, A = stress_and_tangent(self.material, F.reshape(-1, 2, 2))
-        w = (self._weights * there)[..., None, None]
+        w = (self.weights * there)[..., None, None]
         P, A = P.reshape(F.shape) * w, A.reshape(*F.shape, 2, 2) * w[..., None, None]
-        f = np.einsum("eqij,eqaj->eai", P, self._slopes, optimize=True)
-        half = np.einsum("eqijkl,eqbl->eqijkb", A, self._slopes, optimize=True)
-        K = np.einsum("eqijkb,eqaj->eaibk", half, self._slopes, optimize=True)
+        f = np.einsum("eqij,eqaj->eai", P, self.slopes, optimize=True)
+        half = np.einsum("eqijkl,eqbl->eqijkb", A, self.slopes, optimize=True)
+        K = np.einsum("eqijkb,eqaj->eaibk", half, self.slopes, optimize=True)
         total = np.asarray(np.bincount(self._dofs, f.ravel(), u.size), dtype=np.float64)
         return total, csr_array((K.ravel(), (self._rows, self._cols)), shape=(u.size, u.size))
 

@@ -253,9 +253,9 @@ class SpeckleSpec:
         if self.unit not in _CYCLES:
             raise InputError(f"speckle: expected a unit among {list(_CYCLES)}, got {self.unit!r}")
         _require_band_limited(self.cycles_per_px, self.blur_px, "speckle")
-        if not 0.0 <= self.dark < self.bright <= 1.0:
+        if not 0.0 <= self.dark <= self.bright <= 1.0:
             got = f"dark {self.dark}, bright {self.bright}"
-            raise InputError(f"speckle: expected grey levels 0 <= dark < bright <= 1, got {got}")
+            raise InputError(f"speckle: expected grey levels 0 <= dark <= bright <= 1, got {got}")
         require_within("speckle: expected a seed", self.seed, 0)
 
     @property

@@ -238,10 +238,9 @@ def measure(
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
-    TIFF, PNG or JPEG of one size; no pattern of holes is needed. Leaves for each image
-    displacement, standard deviations and strains (HDF5, VTU, CSV, TIFF maps), report.html and
-    summary.json in DIR. In a sequence each image starts from the one before. Run the same command
-    again after an interruption: finished images are not measured again.
+    TIFF, PNG or JPEG of one size; of a plain specimen, all of it in the images, contours are
+    measured. Leaves displacement, standard deviations, strains (HDF5, VTU, CSV, TIFF maps),
+    report.html and summary.json in DIR. Run it again after an interruption: it continues.
 
     For example: modeharvest measure ref.tif def_*.tif --mask mask.png --out out/plate
     """

@@ -44,22 +44,22 @@ def measure_report(
     their ``residual``; without, the report has numbers only, as for the terminal.
     """
     images = summary["images"]
-    table = ReportTable.of("images", images)
-    names = [image["name"] for image in images]
+    by_contours = images[-1]["shown"] == "contours"
+    table = ReportTable.of("contours" if by_contours else "images", images)
+    names, last = [image["name"] for image in images], images[-1]
     shown = np.unique(np.linspace(len(names) - 1, 0, min(_SHOWN, len(names))).round().astype(int))
     maps = [
         Section(f"image-{k + 1}", names[k], _cards(k, names[k], results, residual, summary["unit"]))
         for k in shown
     ] if results and residual else []  # fmt: skip
-    last = images[-1]
     return Report(
         kind="measurement",
         title=summary["title"],
-        findings=[text_of("measure-found", last=last)],
+        findings=[text_of("contours-found" if by_contours else "measure-found", last=last)],
         keys=[
             KeyNumber.of("largest-displacement", last=last),
             KeyNumber.of("standard-deviation", last=last),
-            KeyNumber.of("cutoff", last=last),
+            *([] if by_contours else [KeyNumber.of("cutoff", last=last)]),
             KeyNumber.of("coverage-of-material", number(100 * last["coverage"], 4)),
         ],
         sections=[*maps, Section.of("numbers", Card.tabular(table, wide=True))],
@@ -109,8 +109,9 @@ def _cards(
             for i, j in ((0, 0), (1, 1), (0, 1))
         ],
         "Standard deviation of u, length": [("", partial(nodal, sd, unit, False))],
-        "Residual f − g(x + u)": [("", left)],
     }
+    if result.shown == "speckle":
+        panels["Residual f − g(x + u)"] = [("", left)]
     return [
         Card(title, [ReportFigure(f"map-{k + 1}-{n}-{m}", label, draw)
                      for m, (label, draw) in enumerate(figures)])

@@ -1,10 +1,11 @@
-"""The whole displacement in images of any speckled surface: a folder that can be resumed.
+"""The whole displacement in images of any surface, speckled or plain: a folder to be resumed.
 
 ::
 
     mask.tif  mesh.h5                      prepare   the material, and the mesh of it
     results/NAME.h5 NAME.vtu NAME.csv      NAME      what was measured in one deformed image, see
     results/NAME_u_mm.tif ...                        modeharvest.idic.finite_element.files
+    results/NAME_holes.csv                           the holes, where there is no speckle
     report.html  summary.json                        of all images
     stages.json  timings.json                        which stages are finished, what they took
 
@@ -46,6 +47,12 @@ from modeharvest.idic.photograph.displacement import (
     speckled,
 )
 from modeharvest.idic.photograph.material import find_material
+from modeharvest.idic.photograph.plain import (
+    PlainSurface,
+    displacement_of_plain,
+    plain_surface,
+    write_holes,
+)
 from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
@@ -133,6 +140,12 @@ class MeasureRun(StagedRun[MeasureCase]):
         return None if self.case.mask is None else read_mask(self.case.mask)
 
     @cached_property
+    def plain(self) -> PlainSurface | None:
+        """The reference's contours where it has no speckle; None if it has, or is masked."""
+        of_images = self.case.mask is self.case.mesh is None
+        return plain_surface(self.reference.image) if of_images else None
+
+    @cached_property
     def grid(self) -> PixelGrid:
         """Its pixels [mm or px]."""
         return PixelGrid.centred(*self.reference.shape, self.case.pixel_size or 1.0)
@@ -169,7 +182,11 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _material(self) -> MeshedMaterial:
         """What can be measured of the mask that is given, or is found by its speckle."""
         given, options, image = self._given_mask, FiniteElementOptions(), self.reference.image
-        mask, blank = speckled(image, find_material(image).mask if given is None else given)
+        blank: tuple[str, ...] = ()
+        if self.plain is not None:
+            mask = self.plain.mask
+        else:
+            mask, blank = speckled(image, find_material(image).mask if given is None else given)
         found = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
         return found._replace(changes=(*blank, *found.changes))
 
@@ -230,19 +247,31 @@ class MeasureRun(StagedRun[MeasureCase]):
         tables = [folder / f"{name}.{kind}" for kind in ("h5", "vtu", "csv")]
 
         def work() -> tuple[Path, ...]:
-            names = str(self.case.reference), str(self.case.files[name])
-            pair, body = self.pair(name), self._body
-            known = 0.0 * body.mesh.nodes if before is None else before.displacement
-            start = block_motion(pair, body, known, names)
-            light = self.case.brightness
-            found = displacement_from(start, pair, body, light_degree=light, progress=self.progress)
+            found, *holes = self._measured(name, before, folder)
             write_result(tables[0], found, given)
             write_vtu(tables[1], found, given)
             write_csv(tables[2], found, given=given)
-            return *tables, *write_maps(folder / name, found, given=given)
+            return *tables, *holes, *write_maps(folder / name, found, given=given)
 
         self.do(f"image {name}", key, work)
         return read_result(tables[0])
+
+    def _measured(
+        self, name: str, before: NodalResult | None, folder: Path
+    ) -> tuple[NodalResult, *tuple[Path, ...]]:
+        """Measure an image; leaves a table of the holes where there is no speckle."""
+        pair, body = self.pair(name), self._body
+        if self.plain is not None:
+            found, contours = displacement_of_plain(
+                self.plain, pair.deformed, self.grid, body, self.progress
+            )
+            holes = folder / f"{name}_holes.csv"
+            write_holes(holes, contours, self.case.unit)
+            return found, holes
+        names = str(self.case.reference), str(self.case.files[name])
+        known = 0.0 * body.mesh.nodes if before is None else before.displacement
+        start, light = block_motion(pair, body, known, names), self.case.brightness
+        return (displacement_from(start, pair, body, light_degree=light, progress=self.progress),)
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN off the material."""
@@ -278,7 +307,9 @@ class MeasureRun(StagedRun[MeasureCase]):
             "pixel_size_mm": case.pixel_size,
             "shape_px": list(self.grid.shape),
             "material_px": int(self.material.mask.sum()),
-            "mask": "found by its speckle" if case.mask is case.mesh is None else "given",
+            "mask": "given" if not case.mask is case.mesh is None
+            else "found by its speckle" if self.plain is None
+            else "found by its grey level",
             "notes": list(self.reference.notes),
             "warnings": list(self.material.changes),
             "images": [self._image(name, result) for name, result in results.items()],
@@ -289,19 +320,25 @@ class MeasureRun(StagedRun[MeasureCase]):
         px, mask = self.grid.pixel_size, self.material.mask
         u = result.displacement_on()
         inside = u[mask & np.isfinite(u).all(axis=-1)] / px
-        pair = self.pair(name)
-        gain, offset = (part.mean() for part in brightness(pair, u, self.case.brightness))
-        f, material = pair.reference, pair.masks[0]
-        noise = estimated_noise(f, material).sd * float(np.hypot(1.0, gain))
-        return {
+        numbers = {
             "name": name,
             "rms_px": float(np.sqrt(np.mean(inside**2))),
             "max_px": float(np.linalg.norm(inside, axis=-1).max()),
             "median_sd_px": float(np.median(result.standard_deviation)) / px,
             "coverage": len(inside) / int(mask.sum()),
-            **picked(result, "cutoff_px unknowns effective_unknowns pixels"),
-            "outside_px": result.outside,
+            **picked(result, "shown unknowns effective_unknowns pixels"),
             **picked(result, "residual_rms residual_noise library"),
+            "warnings": list(result.warnings),
+        }
+        if result.shown == "contours":
+            return numbers
+        pair = self.pair(name)
+        gain, offset = (part.mean() for part in brightness(pair, u, self.case.brightness))
+        f, material = pair.reference, pair.masks[0]
+        noise = estimated_noise(f, material).sd * float(np.hypot(1.0, gain))
+        return numbers | {
+            "cutoff_px": result.cutoff_px,
+            "outside_px": result.outside,
             "gain": float(gain),
             "offset": float(offset),
             "image_noise": noise,

@@ -1,0 +1,435 @@
+"""The displacement of a body whose contours alone are seen: a hyperelastic mesh held to them.
+
+A surface without speckle shows where its material ends, and nothing inside or along an edge. What
+is missing there is mechanics: sought is the displacement u of least
+
+    int W(I + grad u) dA + k/2 int d(X + u)^2 dS,
+
+W the energy density of a law, d the signed distance to the contour of the deformed image, less what
+the mesh's own edge is off the contour of the reference. Springs k are stiff, so that the contours
+decide; where the law is right free edges have no traction, and the springs carry nothing. What a
+wrong law does is therefore small, and estimated: by how much laws of other compressibility change
+u. An edge that is straight and stays so is taken to be held by a plate on which it doesn't slide.
+Contours don't show whether it does; what sliding would change counts in the standard deviation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.sparse import csr_array, diags_array
+from scipy.spatial import cKDTree
+
+from modeharvest.fem.field import Mesh, boundary_sides
+from modeharvest.fem.materials import JetMatrix, Material, Ogden, stress_and_tangent
+from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.idic.finite_element.cutoff import Deviations
+from modeharvest.idic.finite_element.fields import interpolation_error, nodal_gradient
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.system import SAMPLES, Body, Imbalance
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, counted, silent
+
+ELASTOMER = Ogden(moduli=(2.0,), exponents=(2.0,), kappa=9.0)
+"""Neo-Hookean, Poisson's ratio 0.45: what is assumed of a body whose law isn't known."""
+_SOFTER, _STIFFER = 7.0 / 3.0, 49.0
+"""Volumetric constants, over the shear modulus, of Poisson's ratios 0.35 and 0.49."""
+_SPRINGS = (0.5, 5.0)
+"""Stiffness of the springs, in turn [shear modulus/px]."""
+_PLATE = 1e6
+"""Stiffness along edges that don't slide [shear modulus times px]."""
+_FAR_PX = 3.0
+"""The mesh's edge is off the contour of the reference by less, or that contour is not known."""
+_FINE_PX = 0.25
+"""Between the points of a contour among which the nearest is sought."""
+_CORNER = np.deg2rad(35.0)
+_LEAST_SIDE, _STRAIGHT, _STAYS_STRAIGHT = 0.2, 2e-3, 5e-3
+"""Length of a straight edge over that of the body, at least, and how far off a straight line it
+may be over its own length, rms, in the reference and in the deformed image."""
+_LOADED = 0.3
+"""Mean traction of an edge that is held over the largest of all straight ones, at least."""
+_GAUSS, _WEIGHTS = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6), np.array([5, 8, 5]) / 18.0
+_ROUGH_PX, _TOLERANCE_PX, _STEPS = 1.0, 0.01, 60
+_LEAST_DET = 0.02
+_CORRELATED_PX = 2.5
+"""Length over which the noise of a contour's points is correlated, about."""
+_PROBES = 4
+_TRIANGULAR, _RECTANGULAR = 6.0, 3.0
+"""Half-width squared over variance of such distributions: of what is most likely in the middle, and
+of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
+
+
+class Contour:
+    """A closed smooth curve through points (n, 2) [mm], each once."""
+
+    def __init__(self, points: FloatArray) -> None:
+        closed = np.vstack([points, points[:1]])
+        length = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+        keep = np.append(length > 1e-3 * np.median(length), True)
+        closed, s = closed[keep], np.concatenate([[0.0], np.cumsum(length[keep[:-1]])])
+        self.points, self.length = np.asarray(closed[:-1], np.float64), float(s[-1])
+        closed[-1] = closed[0]
+        self._curve = CubicSpline(s, closed, bc_type="periodic")
+
+    @cached_property
+    def _fine(self) -> tuple[FloatArray, cKDTree]:
+        step = _FINE_PX * self.length / len(self.points)
+        s = np.linspace(0.0, self.length, int(self.length / step), endpoint=False)
+        return np.asarray(s, dtype=np.float64), cKDTree(self._curve(s))
+
+    @cached_property
+    def moments(self) -> tuple[float, FloatArray, FloatArray]:
+        """Signed area [mm^2], centroid (2,) [mm], second central moments (2, 2) over it [mm^2]."""
+        p, q = self.points, np.roll(self.points, -1, axis=0)
+        cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+        area = 0.5 * float(cross.sum())
+        centre = (p + q).T @ cross / (6.0 * area)
+        a, b = p - centre, q - centre
+        around = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        pairs = np.einsum("ni,nj->nij", a + b, a + b) + np.einsum("ni,nj->nij", a, a)
+        second = np.einsum("nij,n->ij", pairs + np.einsum("ni,nj->nij", b, b), around)
+        return area, np.asarray(centre, np.float64), np.asarray(second / (24.0 * area))
+
+    def distance(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) signed distance of points (n, 2) from the curve [mm], and (n, 2) its gradient."""
+        fine, tree = self._fine
+        s, step = fine[tree.query(x)[1]], self.length / len(self.points)
+        for _ in range(3):
+            off, along, bent = self._curve(s) - x, self._curve(s, 1), self._curve(s, 2)
+            square = (along**2).sum(axis=1)
+            slope = square + (off * bent).sum(axis=1)
+            slope = np.where(slope > 0.2 * square, slope, square)
+            s = np.mod(s - np.clip((off * along).sum(axis=1) / slope, -step, step), self.length)
+        along = self._curve(s, 1)
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return ((x - self._curve(s)) * normal).sum(axis=1), normal
+
+
+@dataclass(frozen=True, eq=False)
+class SeenContours:
+    """Contours of one and the same edges in two images."""
+
+    reference: tuple[Contour, ...]
+    deformed: tuple[Contour, ...]
+    """One after the other, gone along in the same sense [mm]."""
+    noise: float
+    """Variance of their distance times the length over which it is correlated [mm^3]."""
+
+
+class _Edge:
+    """The points of a mesh's edge that are held to contours."""
+
+    def __init__(self, mesh: Mesh, seen: SeenContours, pixel_size: float) -> None:
+        t = _GAUSS
+        N = np.stack([(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)], axis=1)
+        dN = np.stack([4 * t - 3, 4 - 8 * t, 4 * t - 1], axis=1)
+        sides = boundary_sides(mesh)
+        x = mesh.nodes[sides]
+        speed = np.linalg.norm(np.einsum("qa,sai->sqi", dN, x), axis=2)
+        self.length = (speed * _WEIGHTS).ravel()
+        self.points = np.einsum("qa,sai->sqi", N, x).reshape(-1, 2)
+        rows = np.repeat(np.arange(len(self.points)), 3)
+        cols = np.repeat(sides, t.size, axis=0).ravel()
+        values, shape = np.tile(N, (len(sides), 1)).ravel(), (len(self.points), len(mesh.nodes))
+        self.shapes = csr_array((values, (rows, cols)), shape)
+        every = np.vstack([contour.points for contour in seen.reference])
+        number = np.repeat(np.arange(len(seen.reference)), [len(c.points) for c in seen.reference])
+        self.number, self.deformed = number[cKDTree(every).query(self.points)[1]], seen.deformed
+        self.off: FloatArray = np.zeros(len(self.points))
+        self.off, _ = self._distances(self.points, seen.reference)
+        self.length[np.abs(self.off) > _FAR_PX * pixel_size] = 0.0
+
+    def _distances(
+        self, x: FloatArray, contours: Sequence[Contour]
+    ) -> tuple[FloatArray, FloatArray]:
+        d, normal = np.empty(len(x)), np.empty_like(x)
+        for k, contour in enumerate(contours):
+            own = self.number == k
+            d[own], normal[own] = contour.distance(x[own])
+        return d - self.off, normal
+
+    def distances(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(q,) signed distances [mm] at displacements (n, 2), (q, 2) their gradients."""
+        return self._distances(self.points + self.shapes @ u, self.deformed)
+
+    def normal_shapes(self, normal: FloatArray) -> csr_array:
+        """(q, 2 n) what displacements are along the normals (q, 2)."""
+        shapes = self.shapes
+        data = shapes.data[:, None] * normal[np.repeat(np.arange(len(normal)), 3)]
+        cols = 2 * shapes.indices[:, None] + np.arange(2)
+        return csr_array(
+            (data.ravel(), cols.ravel(), 2 * shapes.indptr), (len(normal), 2 * shapes.shape[1])
+        )
+
+
+def straight_sides(mesh: Mesh) -> tuple[IntArray, ...]:
+    """Straight edges of a mesh between its corners: nodes of each, (k,), one after the other."""
+    sides = boundary_sides(mesh)
+    after, found = dict(zip(sides[:, 0], sides, strict=True)), []
+    size = float(np.ptp(mesh.nodes, axis=0).max())
+    while after:
+        begin, loop = next(iter(after)), []
+        while begin in after:
+            side = after.pop(begin)
+            loop.append(side)
+            begin = side[2]
+        ring = np.array(loop)
+        along = mesh.nodes[ring[:, 2]] - mesh.nodes[ring[:, 0]]
+        before = np.roll(along, 1, axis=0)
+        cross = before[:, 0] * along[:, 1] - before[:, 1] * along[:, 0]
+        turn = np.abs(np.arctan2(cross, (before * along).sum(axis=1)))
+        corners = np.flatnonzero(turn > _CORNER)
+        for k, end in zip(corners, np.roll(corners, -1), strict=True):
+            count = int((end - k) % len(ring)) or len(ring)
+            part = ring[(k + np.arange(count)) % len(ring)]
+            nodes = np.append(part[:, :2].ravel(), part[-1, 2])
+            x = mesh.nodes[nodes]
+            if np.linalg.norm(x[-1] - x[0]) > _LEAST_SIDE * size and _bend(x) < _STRAIGHT:
+                found.append(nodes)
+    return tuple(found)
+
+
+def _bend(x: FloatArray) -> float:
+    """Rms distance of points (k, 2) from a straight line, over their length."""
+    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
+    return float(spread[1] / np.sqrt(len(x)) / np.linalg.norm(x[-1] - x[0]))
+
+
+class _PenalisedBody:
+    """A hyperelastic mesh held to contours, on its way to least energy."""
+
+    def __init__(
+        self, body: Body, seen: SeenContours, grid: PixelGrid, law: Material, start: FloatArray
+    ) -> None:
+        self.mesh, self.px = body.mesh, grid.pixel_size
+        self.edge = _Edge(body.mesh, seen, self.px)
+        if not self.edge.length.any():
+            raise InputError("expected contours at the mesh's edge, got none")
+        self.u: FloatArray = start.ravel().copy()
+        self._none = np.zeros(len(self.mesh.nodes), dtype=np.bool_)
+        self._use(law)
+        _, self._first = self.law.forces(0.0 * self.u)
+        self.stiffness = 0.0
+        self.plates = csr_array((0, self.u.size))
+        self.stretched: FloatArray = np.zeros(0)
+        self.pressed: list[BoolArray] = []
+        self._factor: Factor | None = None
+        self._stored = 0
+
+    def _use(self, law: Material) -> None:
+        """Take a law, with its moduli over the shear modulus."""
+        self.law = Imbalance(self.mesh, law, self._none)
+        self.shear = float(stress_and_tangent(law, np.eye(2)[None])[1][0, 0, 1, 0, 1])
+
+    def energy(self, u: FloatArray) -> float:
+        """Of the body and its springs [N/mm times mm]; infinite where it is turned inside out."""
+        cells = u.reshape(-1, 2)[self.mesh.cells]
+        F = np.eye(2) + np.einsum("eai,eqaj->eqij", cells, self.law.slopes)
+        if np.linalg.det(F).min() < _LEAST_DET:
+            return np.inf
+        W = self.law.material.energy(JetMatrix(F.reshape(-1, 2, 2))).value
+        d, _ = self.edge.distances(u.reshape(-1, 2))
+        springs = self.stiffness * float(self.edge.length @ d**2)
+        plates = self.plates @ u + self.stretched
+        own = float(W @ np.broadcast_to(self.law.weights, F.shape[:2]).ravel())
+        return own / self.shear + 0.5 * (springs + float(plates @ plates))
+
+    def linearised(self) -> tuple[csr_array, csr_array, FloatArray]:
+        """(2 n, 2 n) tangent stiffness, that of the springs in it, (2 n,) forces, all over mu."""
+        f, K = self.law.forces(self.u)
+        d, normal = self.edge.distances(self.u.reshape(-1, 2))
+        B = self.edge.normal_shapes(normal)
+        weighed = diags_array(self.stiffness * self.edge.length) @ B
+        D, springs = self.plates, csr_array(B.T @ weighed)
+        forces = f / self.shear + weighed.T @ d + D.T @ (D @ self.u + self.stretched)
+        return csr_array(K / self.shear + springs + D.T @ D), springs, forces
+
+    def factor(self, A: csr_array) -> Factor:
+        """Factorise, the order of elimination kept; ArithmeticError if it is singular."""
+        A.sort_indices()
+        if self._factor is None or self._stored != A.nnz:
+            self._factor, self._stored = factorise(A), A.nnz
+        else:
+            self._factor.update(A)
+        return self._factor
+
+    def relax(self, springs: float, tolerance_px: float) -> None:
+        """Newton's method with Levenberg's safeguard to least energy; springs in mu/px."""
+        self.stiffness = springs / self.px
+        energy, damping, safe = self.energy(self.u), 1e-3, self._first / self.shear
+        for _ in range(_STEPS):
+            A, _, forces = self.linearised()
+            while True:
+                try:
+                    step = self.factor(csr_array(A + damping * safe)).solve(-forces)
+                    there = self.energy(self.u + step) if -step @ forces > 0.0 else np.inf
+                except ArithmeticError:
+                    there = np.inf
+                if there < energy or damping > 1e3:
+                    break
+                damping *= 5.0
+            if there >= energy:
+                return  # to rounding
+            self.u, energy = self.u + step, there
+            longest = float(np.linalg.norm(step.reshape(-1, 2), axis=1).max()) / self.px
+            if longest * (1.0 + damping) < tolerance_px:
+                return
+            damping *= 0.2
+
+    def pressed_sides(self) -> tuple[IntArray, ...]:
+        """The straight edges that something presses or pulls."""
+        d, normal = self.edge.distances(self.u.reshape(-1, 2))
+        seen = self.edge.points + self.edge.shapes @ self.u.reshape(-1, 2) - d[:, None] * normal
+        first = self.edge.shapes.indices.reshape(-1, 3)[:, 1]
+        sides, tractions = [], []
+        for nodes in straight_sides(self.mesh):
+            own = np.isin(first, nodes) & (self.edge.length > 0.0)
+            if own.any() and _bend(seen[own]) < _STAYS_STRAIGHT:
+                sides.append(nodes)
+                tractions.append(abs(np.average(d[own], weights=self.edge.length[own])))
+        most = max(tractions, default=0.0)
+        return tuple(s for s, t in zip(sides, tractions, strict=True) if t > _LOADED * most)
+
+    def press(self, sides: Sequence[IntArray], *, slides: bool) -> None:
+        """Let plates press straight edges, which keep their length unless they slide."""
+        first = self.edge.shapes.indices.reshape(-1, 3)[:, 1]
+        self.pressed = [np.isin(first, nodes) & (self.edge.length > 0.0) for nodes in sides]
+        if slides or not sides:
+            return
+        ends = np.vstack([np.stack([nodes[:-1], nodes[1:]], axis=1) for nodes in sides])
+        moved = self.mesh.nodes + self.u.reshape(-1, 2)
+        along = np.vstack([np.tile(moved[s[-1]] - moved[s[0]], (len(s) - 1, 1)) for s in sides])
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        gaps = np.diff(self.mesh.nodes[ends], axis=1)[:, 0]
+        length = np.linalg.norm(gaps, axis=1)
+        root = np.sqrt(_PLATE * self.px / length)
+        values = (root[:, None] * along)[:, None, :] * np.array([-1.0, 1.0])[:, None]
+        cols = 2 * ends[:, :, None] + np.arange(2)
+        rows = np.repeat(np.arange(len(ends)), 4)
+        shape = len(ends), self.u.size
+        self.plates = csr_array((values.ravel(), (rows, cols.ravel())), shape)
+        self.stretched = root * ((along * gaps).sum(axis=1) - length)
+
+    def take_up(self, stiffer: float) -> None:
+        """Take up by how much springs, to become so many times stiffer, give way under plates.
+
+        Their traction is no error of the law: they would be compressed by it where noise isn't.
+        """
+        d, _ = self.edge.distances(self.u.reshape(-1, 2))
+        for own in self.pressed:
+            self.edge.off[own] -= np.average(d[own], weights=self.edge.length[own]) / stiffer
+
+    def change_by(self, law: Material | None = None, slides: bool = False) -> FloatArray:
+        """(n, 2) by how much another law, or edges that slide, would change u [mm], about."""
+        kept = self.law, self.shear, self.plates, self.stretched
+        if law is not None:
+            self._use(law)
+        if slides:
+            self.plates, self.stretched = self.plates[:0], self.stretched[:0]
+        A, _, forces = self.linearised()
+        step = self.factor(A).solve(-forces)
+        self.law, self.shear, self.plates, self.stretched = kept
+        return step.reshape(-1, 2)
+
+
+def displacement_from_contours(
+    seen: SeenContours,
+    body: Body,
+    grid: PixelGrid,
+    start: FloatArray,
+    law: Material | None = None,
+    *,
+    slides: bool = False,
+    progress: Progress = silent,
+) -> NodalResult:
+    """Find the displacement of a body from the contours of its edges.
+
+    InputError if no contour is at the mesh's edge.
+
+    seen : contours in the reference and in the deformed image [mm].
+    body : T6 mesh of the material in the reference.
+    grid : pixels of the images.
+    start : (n, 2) displacement [mm] within which each contour is nearer to its own than half a
+        hole; an affine motion will do.
+    law : of the body, in plane strain; by default :data:`ELASTOMER`. A factor doesn't matter.
+    slides : whether edges slide on plates, which isn't seen; by default they don't.
+    progress : listener.
+    """
+    state = _PenalisedBody(body, seen, grid, law or ELASTOMER, start)
+    soft, stiff = _SPRINGS
+    sides: tuple[IntArray, ...] = ()
+    before = state.u
+    for stage in counted(range(3), progress, "displacement from contours"):
+        if stage == 0:
+            state.relax(soft, _ROUGH_PX)
+            sides = state.pressed_sides()
+            state.press(sides, slides=slides)
+        elif stage == 1:
+            state.relax(soft, 10.0 * _TOLERANCE_PX)
+            before = state.u
+        else:
+            state.take_up(stiff / soft)
+            state.relax(stiff, _TOLERANCE_PX)
+    u, mesh = state.u.reshape(-1, 2), body.mesh
+    left = np.asarray(state.u - before).reshape(-1, 2) * (soft / (stiff - soft))
+    sd, known = _deviations(state, seen.noise, law is None, bool(sides) and not slides, left)
+    used = state.edge.length > 0.0
+    d, _ = state.edge.distances(u)
+    return NodalResult(
+        mesh=mesh,
+        displacement=u,
+        start=start,
+        standard_deviation=np.hypot(sd.by_noise, sd.bias),
+        noise_deviation=sd.by_noise,
+        gradient_covariance=sd.gradient,
+        roots=sd.roots,
+        grid=grid,
+        cutoff_px=0.0,
+        tried=(),
+        residual_rms=float(np.sqrt(np.average(d**2, weights=state.edge.length))) / grid.pixel_size,
+        residual_noise=float(np.sqrt(seen.noise / _CORRELATED_PX / grid.pixel_size))
+        / grid.pixel_size,
+        pixels=int(state.edge.length.sum() / grid.pixel_size),
+        outside=int((~used).sum()),
+        effective_unknowns=known,
+        library="" if state._factor is None else state._factor.library,
+        shown="contours",
+    )
+
+
+def _deviations(
+    state: _PenalisedBody, noise: float, law_is_assumed: bool, may_slide: bool, left: FloatArray
+) -> tuple[Deviations, float]:
+    """Standard deviations by noise, law, plates, springs; how many unknowns contours determine."""
+    mesh, edge, rng = state.mesh, state.edge, np.random.default_rng(0)
+    A, springs, _ = state.linearised()
+    _, normal = edge.distances(state.u.reshape(-1, 2))
+    weighed = diags_array(state.stiffness * np.sqrt(edge.length * noise)) @ edge.normal_shapes(
+        normal
+    )
+    random = weighed.T @ rng.standard_normal((len(normal), SAMPLES))
+    z = rng.choice([-1.0, 1.0], (state.u.size, _PROBES))
+    found = state.factor(A).solve(np.column_stack([random, springs @ z]))
+    known = float(np.sum(z * found[:, SAMPLES:])) / _PROBES
+    samples = found[:, :SAMPLES].reshape(-1, 2, SAMPLES)
+    slopes = nodal_gradient(mesh, samples.reshape(len(samples), -1)).reshape(-1, 2, SAMPLES, 2)
+    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
+    error = interpolation_error(mesh, state.u.reshape(-1, 2))
+    none = samples[..., :0]
+    sd = Deviations(samples, none, none, error, spread).with_bias(mesh, left)
+    changes = []
+    if law_is_assumed:
+        laws = (Ogden(ELASTOMER.moduli, ELASTOMER.exponents, k) for k in (_SOFTER, _STIFFER))
+        changes = [state.change_by(other) / np.sqrt(2.0 * _TRIANGULAR) for other in laws]
+    if may_slide:
+        changes.append(state.change_by(slides=True) / np.sqrt(_RECTANGULAR))
+    for change in changes:
+        sd = sd.with_bias(mesh, change)
+    return sd, known

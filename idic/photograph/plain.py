@@ -1,0 +1,306 @@
+"""Photographs of a plain specimen, without speckle: its material, its contours, its holes.
+
+Such a picture has two grey levels, and its information is where they meet. Contours are taken at
+half-way between the levels around, which may vary slowly over the picture, after a blur of less
+than a pixel: a straight edge is then found within noise, one of radius R off by 0.5 px^2/R.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, label
+from scipy.optimize import linear_sum_assignment
+from skimage.filters import threshold_otsu
+
+from modeharvest.idic.finite_element.contours import (
+    Contour,
+    SeenContours,
+    displacement_from_contours,
+)
+from modeharvest.idic.finite_element.mesh import find_contours
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.system import Body
+from modeharvest.idic.solver.noise import estimated_noise
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic
+from modeharvest.util.masks import large_parts, shrunk
+from modeharvest.util.progress import Progress, silent
+
+_BLUR_PX = 0.7
+_TWO_LEVELS = 0.9
+"""Share of a picture's variance that two grey levels explain: 0.98 of plain pictures with noise of
+1 %, 0.67 to 0.81 of speckled ones with a background."""
+_LIGHT_SHARE = 0.1
+"""Over which part of the picture's shorter side grey levels are averaged."""
+_ROUNDS = 3
+_INSIDE_PX = 4.0
+"""Pixels farther than this from any edge show the grey levels."""
+_SPECKLE_PX, _LAG_PX = 8.0, 2
+_FAINTEST, _ALIKE_GREY = 0.02, 0.3
+"""Speckle is what varies by more than a fiftieth of the step at edges, and is alike 2 px away."""
+_LEAST_PX2 = 60.0
+"""Area of a hole or island; smaller ones are dirt."""
+_TURNS_DEG = np.arange(-24.0, 25.0, 6.0)
+"""Rotations of the specimen between two pictures that are tried."""
+_ALIKE = 0.4
+"""Share of the distance to the next hole within which a hole is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlainSurface:
+    """A picture of two grey levels."""
+
+    mask: BoolArray
+    """(rows, cols) True on material."""
+    contours: tuple[FloatArray, ...]
+    """(n, 2) points (row, col) [px] of each, the outer one of the material first, then those of its
+    holes."""
+    noise: float
+    """Variance of a contour's distance times the length over which it is correlated [px^3]."""
+
+
+def plain_surface(image: FloatImage) -> PlainSurface | None:
+    """What a picture (rows, cols) shows if it shows a plain material; None if it has speckle.
+
+    InputError if the material reaches the picture's border.
+    """
+    grey = gaussian_filter(np.asarray(image, dtype=np.float32), _BLUR_PX)
+    bright = grey > float(threshold_otsu(grey))  # type: ignore[no-untyped-call]
+    for _ in range(_ROUNDS):
+        if not 0 < bright.sum() < bright.size:
+            return None
+        above, below = _level(grey, bright), _level(grey, ~bright)
+        left = grey - np.where(bright, above, below)
+        bright = grey > 0.5 * (above + below)
+    if left.var() > (1.0 - _TWO_LEVELS) * grey.var():
+        return None
+    border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]])
+    is_bright = bool(border.mean() < 0.5)  # the material
+    material = large_parts(bright if is_bright else ~bright, int(_LEAST_PX2))
+    edge = np.concatenate([material[0], material[-1], material[:, 0], material[:, -1]])
+    if not material.any():
+        return None
+    if edge.any():
+        raise InputError(
+            "expected all of a specimen without speckle in the picture, got material at "
+            f"{int(edge.sum())} px of its border; take it from farther away, or crop nothing"
+        )
+    material |= ~large_parts(~material, int(_LEAST_PX2))
+    material = _largest(material)
+    contours = []
+    for points in find_contours((grey - 0.5 * (above + below)).astype(np.float64), 0.0):
+        row, col = np.rint(points[len(points) // 2]).astype(int)
+        around = np.s_[max(0, row - 2) : row + 3, max(0, col - 2) : col + 3]
+        closed = len(points) > 8 and np.allclose(points[0], points[-1])
+        if closed and material[around].any() and abs(_area(points)) > _LEAST_PX2:
+            contours.append(points[:-1])
+    contours.sort(key=lambda points: -abs(_area(points)))
+    if not contours or _shows_speckle(image, material, above - below):
+        return None
+    # White noise of the pixels, blurred: its variance at a point times its correlation length.
+    noise = estimated_noise(image, material).sd ** 2 / (2.0 * np.sqrt(np.pi) * _BLUR_PX)
+    return PlainSurface(material, tuple(contours), noise / _slope(grey, contours) ** 2)
+
+
+def _largest(material: BoolArray) -> BoolArray:
+    """The largest island, with its holes."""
+    islands, count = label(material)
+    if count < 2:
+        return material
+    return np.asarray(islands == 1 + np.argmax(np.bincount(islands.ravel())[1:]))
+
+
+def _inside(material: BoolArray) -> BoolArray:
+    inside = shrunk(material, _INSIDE_PX)
+    return inside if inside.any() else material
+
+
+def _level(grey: FloatImage, region: BoolArray) -> FloatArray:
+    """(rows, cols) grey level of a region, away from its edges, as it is around each pixel."""
+    inside = _inside(region)
+    mean, width = float(grey[inside].mean()), _LIGHT_SHARE * min(grey.shape)
+    weight = gaussian_filter(inside.astype(np.float32), width) + np.float32(1e-3)
+    light = gaussian_filter(np.where(inside, grey - mean, 0.0).astype(np.float32), width)
+    return np.asarray(mean + light / weight, dtype=np.float64)
+
+
+def _shows_speckle(image: FloatImage, material: BoolArray, step: FloatArray) -> bool:
+    """Whether the material's grey level varies by more than noise, which pixels don't share."""
+    inside = _inside(material)
+    weight = gaussian_filter(inside.astype(np.float32), _SPECKLE_PX) + np.float32(1e-6)
+    grey = np.where(inside, image, 0.0).astype(np.float32)
+    fine = np.where(inside, image - gaussian_filter(grey, _SPECKLE_PX) / weight, 0.0)
+    both = inside[:, _LAG_PX:] & inside[:, :-_LAG_PX]
+    if fine[inside].std() < _FAINTEST * abs(float(step[inside].mean())) or not both.any():
+        return False
+    alike = np.corrcoef(fine[:, _LAG_PX:][both], fine[:, :-_LAG_PX][both])[0, 1]
+    return bool(alike > _ALIKE_GREY)
+
+
+def _slope(grey: FloatImage, contours: Sequence[FloatArray]) -> float:
+    """Typical slope of the grey level at contours [grey levels/px]."""
+    row, col = np.rint(np.vstack(contours)).astype(int).T
+    slopes = [part[row, col] for part in np.gradient(grey)]
+    return float(np.median(np.hypot(*slopes)))
+
+
+def _area(points: FloatArray) -> float:
+    after = np.roll(points, -1, axis=0)
+    return 0.5 * float(np.sum(points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]))
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedContours:
+    """The same contours in two pictures."""
+
+    seen: SeenContours
+    affine: FloatArray
+    """(3, 2): a point's displacement is about (x, y, 1) times this [-, and mm]."""
+    holes: tuple[tuple[Contour, Contour], ...]
+    """In the reference and in the deformed picture."""
+    lost: int
+    """Holes of the reference that weren't found in the deformed picture."""
+
+    def start(self, points: FloatArray) -> FloatArray:
+        """(n, 2) displacement of points (n, 2) [mm] by the affine motion."""
+        return np.column_stack([points, np.ones(len(points))]) @ self.affine
+
+
+def matched_contours(
+    reference: PlainSurface, deformed: PlainSurface, grid: PixelGrid
+) -> MatchedContours:
+    """Find each contour of a picture again in another one.
+
+    InputError if fewer than half of the holes are found.
+    """
+    f, g = (
+        [Contour(np.column_stack(grid.to_mm(*points.T))) for points in surface.contours]
+        for surface in (reference, deformed)
+    )
+    outer, holes, others = (f[0], g[0]), f[1:], g[1:]
+    a = np.array([contour.moments[1] for contour in f])
+    b = np.array([contour.moments[1] for contour in g])
+    pairs = _paired(a[1:], b[1:]) if len(holes) > 2 and len(others) > 2 else []
+    if 2 * len(pairs) < len(holes):
+        raise InputError(
+            f"expected the reference's {len(holes)} holes in the deformed picture, found "
+            f"{len(pairs)} of them among {len(others)}; give pictures in "
+            "between, or of one and the same specimen"
+        )
+    found = tuple((holes[i], others[j]) for i, j in pairs)
+    if len(pairs) < 3:
+        sizes = [np.sqrt(np.diag(contour.moments[2])) for contour in outer]
+        linear = np.diag(sizes[1] / sizes[0])
+        affine = np.vstack([linear - np.eye(2), b[0] - a[0] @ linear])
+    else:
+        at = 1 + np.array(pairs).T
+        affine = _affine(a[at[0]], b[at[1]])
+    every = (outer, *found)
+    noise = (reference.noise + deformed.noise) * grid.pixel_size**3
+    seen = SeenContours(tuple(c for c, _ in every), tuple(c for _, c in every), noise)
+    return MatchedContours(seen, affine, found, len(holes) - len(found))
+
+
+def _affine(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(3, 2) the affine displacement of points a to points b (n, 2)."""
+    return np.asarray(np.linalg.lstsq(np.column_stack([a, np.ones(len(a))]), b - a)[0])
+
+
+def _paired(a: FloatArray, b: FloatArray) -> list[tuple[int, int]]:
+    """Which of the points a (n, 2) is which of b (m, 2), turned, stretched and shifted."""
+    near = np.linalg.norm(a[:, None] - a, axis=2) + 1e9 * np.eye(len(a))
+    reach = _ALIKE * float(np.median(near.min(axis=1)))
+    best: tuple[float, FloatArray] = (np.inf, a)
+    for turn in np.deg2rad(_TURNS_DEG):
+        back = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        upright = (b - b.mean(axis=0)) @ back
+        centred = a - a.mean(axis=0)
+        scale = upright.std(axis=0) / np.maximum(centred.std(axis=0), 1e-12)
+        there = (centred * np.where(centred.std(axis=0) > 0.0, scale, 1.0)) @ back.T + b.mean(
+            axis=0
+        )
+        distance = np.linalg.norm(there[:, None] - b, axis=2)
+        cost = float(np.minimum(distance.min(axis=1), reach).sum())
+        best = min(best, (cost, there), key=lambda found: found[0])
+    there = best[1]
+    for _ in range(3):
+        distance = np.linalg.norm(there[:, None] - b, axis=2)
+        i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
+        ok = distance[i, j] < reach
+        i, j = i[ok], j[ok]
+        if len(i) < 3:
+            break
+        there = a + np.column_stack([a, np.ones(len(a))]) @ _affine(a[i], b[j])
+    return list(zip(i.tolist(), j.tolist(), strict=True))
+
+
+def displacement_of_plain(
+    reference: PlainSurface,
+    image: FloatImage,
+    grid: PixelGrid,
+    body: Body,
+    progress: Progress = silent,
+) -> tuple[NodalResult, MatchedContours]:
+    """The displacement in another picture (rows, cols) of a plain specimen, and its contours.
+
+    ``body``: a mesh of the reference's material. InputError if the picture shows no plain specimen,
+    or another one.
+    """
+    deformed = plain_surface(image)
+    if deformed is None:
+        raise InputError(
+            "expected two grey levels like the reference's, got a picture with more: a plain "
+            "specimen can't be found in it; light it evenly, or give a mask if it has speckle"
+        )
+    matched = matched_contours(reference, deformed, grid)
+    start = matched.start(body.mesh.nodes)
+    return displacement_from_contours(matched.seen, body, grid, start, progress=progress), matched
+
+
+@dataclass(frozen=True)
+class HoleShape:
+    """A hole's shape, by the moments of its contour."""
+
+    x: float
+    y: float
+    """Its centre [mm]."""
+    area: float
+    """[mm^2]."""
+    ellipticity: float
+    """1 less the ratio of the ellipse's axes that has the same second moments [-]."""
+    orientation_deg: float
+    """Of the longer axis, from x, anticlockwise, -90 to 90 [degrees]."""
+
+    @classmethod
+    def of(cls, contour: Contour) -> HoleShape:
+        """Of a contour [mm]."""
+        area, (x, y), second = contour.moments
+        values, vectors = np.linalg.eigh(second)
+        along = vectors[:, 1] * np.sign(vectors[0, 1] or 1.0)
+        ratio = float(np.sqrt(values[0] / values[1]))
+        angle = float(np.degrees(np.arctan2(along[1], along[0])))
+        return cls(float(x), float(y), abs(area), 1.0 - ratio, angle)
+
+
+def write_holes(path: Path, matched: MatchedContours, unit: str = "mm") -> None:
+    """Write the holes' shapes in both pictures as a table (CSV), atomically."""
+    heads = (
+        f"x [{unit}]",
+        f"y up [{unit}]",
+        f"area [{unit}^2]",
+        "ellipticity [-]",
+        "orientation [degrees]",
+    )
+    with atomic(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow([f"{when} {head}" for when in ("reference", "deformed") for head in heads])
+        for pair in matched.holes:
+            values = [value for hole in pair for value in astuple(HoleShape.of(hole))]
+            table.writerow([f"{value:.6g}" for value in values])

@@ -1,0 +1,237 @@
+"""Specimens without speckle: their contours, and the displacement that these alone determine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import brentq
+
+from modeharvest.fem.field import Solution
+from modeharvest.fem.materials import stress_and_tangent
+from modeharvest.idic.finite_element.contours import (
+    ELASTOMER,
+    Contour,
+    displacement_from_contours,
+    straight_sides,
+)
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.photograph.plain import (
+    HoleShape,
+    displacement_of_plain,
+    matched_contours,
+    plain_surface,
+)
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.photographs.files import read_image
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.runs.measure import measure
+from modeharvest.util.arrays import FloatArray, FloatImage
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json
+
+SHIPPED = Path(__file__).parents[1] / "src/modeharvest/cases/paper-virtual.h5"
+PLAIN = ImagingSpec(
+    pixel_size=0.04,
+    margin_px=12,
+    background=0.15,
+    speckle=SpeckleSpec(dark=0.7, bright=0.7),
+    sensor=Sensor(fill_factor=1.0, psf_px=0.6, read_noise=0.01),
+)
+FINE = 8
+
+
+def disks(
+    shape: tuple[int, int], frame: float, centres: FloatArray, axes: FloatArray, angle: float
+) -> FloatImage:
+    """A grey plate with elliptical holes on black, as pixels average it."""
+    rows, cols = (np.arange(FINE * n) / FINE - 0.5 + 0.5 / FINE for n in shape)
+    y, x = rows[:, None], cols[None]
+    plate = (np.abs(y - (shape[0] - 1) / 2) < shape[0] / 2 - frame) & (
+        np.abs(x - (shape[1] - 1) / 2) < shape[1] / 2 - frame
+    )
+    c, s = np.cos(angle), np.sin(angle)
+    for row, col in centres:
+        right, up = x - col, row - y
+        along, across = c * right + s * up, c * up - s * right
+        plate &= (along / axes[0]) ** 2 + (across / axes[1]) ** 2 > 1.0
+    fine = plate.reshape(shape[0], FINE, shape[1], FINE).mean(axis=(1, 3))
+    return np.asarray(0.1 + 0.6 * fine, dtype=np.float32)
+
+
+CENTRES = np.array([[40.3, 40.2], [40.3, 90.9], [90.6, 41.1], [91.2, 91.4]])
+
+
+@settings(max_examples=6, deadline=None)
+@given(a=st.floats(8.0, 18.0), ratio=st.floats(0.6, 0.95), angle=st.floats(-1.5, 1.5))
+def test_holes_are_found_to_a_hundredth_of_a_pixel(a: float, ratio: float, angle: float) -> None:
+    image = disks((132, 132), 15.25, CENTRES, np.array([a, ratio * a]), angle)
+    grid = PixelGrid.centred(132, 132, 1.0)
+    seen = plain_surface(image)
+    assert seen is not None
+    assert len(seen.contours) == 5
+    same = matched_contours(seen, seen, grid)
+    found = [HoleShape.of(hole) for hole, _ in same.holes]
+    found.sort(key=lambda h: (-round(h.y, -1), h.x))
+    x, y = grid.to_mm(*CENTRES.T)
+    assert np.allclose([h.x for h in found], x, atol=0.02)
+    assert np.allclose([h.y for h in found], y, atol=0.02)
+    # A blur of variance s^2 moves an edge of radius R by s^2/2R: around a hole that is pi s^2.
+    area = np.pi * (ratio * a**2 - 0.7**2 - 1 / 12)
+    assert np.allclose([h.area for h in found], area, atol=1.5)
+    assert np.allclose([h.ellipticity for h in found], 1.0 - ratio, atol=0.01)
+    off = np.array([h.orientation_deg for h in found]) - np.degrees(angle)
+    assert np.abs((off + 90.0) % 180.0 - 90.0).max() < 1.5
+
+
+def test_contours_do_not_depend_on_which_is_bright_nor_on_the_light() -> None:
+    image = disks((132, 132), 15.25, CENTRES, np.array([15.0, 11.0]), 0.3)
+    light = np.linspace(0.9, 1.1, 132, dtype=np.float32)
+    plain, dark, lit = (plain_surface(one) for one in (image, 0.9 - image, light * image))
+    assert plain
+    assert dark
+    assert lit
+    assert np.array_equal(plain.mask, dark.mask)
+    every = [Contour(points) for points in lit.contours]
+    for points in plain.contours:
+        off = min(np.abs(contour.distance(points)[0]).max() for contour in every)
+        assert off < 0.05
+
+
+def test_distance_from_a_circle_and_its_gradient() -> None:
+    t = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+    circle = Contour(np.stack([3.0 * np.cos(t), 3.0 * np.sin(t)], axis=1))
+    x = np.random.default_rng(0).uniform(-5.0, 5.0, (100, 2))
+    x = x[np.abs(np.linalg.norm(x, axis=1) - 3.0) < 1.5]
+    d, normal = circle.distance(x)
+    assert np.allclose(d, np.linalg.norm(x, axis=1) - 3.0, atol=1e-6)
+    step = 1e-5 * np.eye(2)
+    slope = [(circle.distance(x + s)[0] - circle.distance(x - s)[0]) / 2e-5 for s in step]
+    assert np.allclose(np.stack(slope, axis=1), normal, atol=1e-5)
+
+
+def test_moments_of_an_ellipse() -> None:
+    t = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
+    area, centre, second = Contour(
+        np.stack([1.0 + 3.0 * np.cos(t), 2.0 + np.sin(t)], axis=1)
+    ).moments
+    assert area == pytest.approx(3.0 * np.pi, rel=1e-5)
+    assert np.allclose(centre, [1.0, 2.0])
+    assert np.allclose(second, np.diag([9.0, 1.0]) / 4.0, rtol=1e-5)
+
+
+def plate(half: FloatArray, centre: FloatArray) -> FloatImage:
+    """A plate in 140 x 200 px, as pixels average it; (x, y) half its size and its centre [px]."""
+    covered = []
+    for n, h, c in zip((200, 140), half, centre, strict=True):
+        edges = np.arange(n + 1) - n / 2
+        covered.append(np.diff(np.clip(edges - c, -h, h)))
+    return np.asarray(0.1 + 0.6 * covered[1][::-1, None] * covered[0], dtype=np.float32)
+
+
+def test_a_bar_that_is_pressed_between_frictionless_plates_shortens_evenly() -> None:
+    # A homogeneous deformation whose sides are free of traction by the assumed law.
+    def traction(across: float) -> float:
+        return float(stress_and_tangent(ELASTOMER, np.diag([0.9, across])[None])[0][0, 1, 1])
+
+    half, stretches = np.array([80.3, 50.4]), np.array([0.9, brentq(traction, 0.8, 1.3)])
+    shift, grid = np.array([3.2, -1.7]), PixelGrid.centred(140, 200, 0.1)
+    images = plate(half, np.zeros(2)), plate(half * stretches, shift)
+    seen = [plain_surface(image) for image in images]
+    assert seen[0]
+    assert seen[1]
+    contours = matched_contours(seen[0], seen[1], grid).seen
+    body = FiniteElementOptions().body(seen[0].mask, grid)
+    start = np.zeros((len(body.mesh.nodes), 2))
+    assert len(straight_sides(body.mesh)) == 4
+    u = body.mesh.nodes * (stretches - 1.0) + 0.1 * shift
+    free = displacement_from_contours(contours, body, grid, start, slides=True)
+    off = np.abs(free.displacement - u) / grid.pixel_size
+    # The springs give way by the traction over their stiffness, a few hundredths of a pixel.
+    assert np.sqrt(np.mean(off**2)) < 0.04
+    assert off.max() < 0.3
+    stuck = displacement_from_contours(contours, body, grid, start)
+    x = np.abs(body.mesh.nodes[:, 0])
+    at_plates = x > x.max() - 0.01
+    assert np.ptp(stuck.displacement[at_plates, 1]) < 0.02 * grid.pixel_size
+    # Which of the two it is can't be seen, and is part of the standard deviation.
+    within = np.abs(stuck.displacement - u) < 3.0 * stuck.standard_deviation + 1e-3
+    assert within.mean() > 0.95
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("plain")
+    make_images(Solution.read(SHIPPED), PLAIN, folder, (0.128,))
+    return folder
+
+
+def test_a_buckled_specimen_without_speckle(photographed: Path) -> None:
+    solution = Solution.read(SHIPPED)
+    images = make_images(solution, PLAIN, photographed, (0.128,))
+    (pair,) = images
+    px, u = pair.grid.pixel_size, pair.truth.displacement
+    f, g = (
+        read_image(photographed / f"{name}_8bit.tif") for name in ("reference", "deformed_1280")
+    )
+    surface = plain_surface(f)
+    assert surface is not None
+    body = FiniteElementOptions().body(surface.mask, pair.grid)
+    result, matched = displacement_of_plain(surface, g, pair.grid, body)
+    assert matched.lost == 0
+    assert len(matched.holes) == 60
+    found = result.displacement_on()
+    there = np.isfinite(u[..., 0]) & surface.mask & np.isfinite(found[..., 0])
+    off = (found - u)[there] / px
+    # The assumed law is another one than the specimen's.
+    assert np.sqrt(np.mean(off**2)) < 0.06
+    sd = result.standard_deviation_on()[there] / px
+    assert 0.9 < np.mean(np.abs(off) < 1.96 * sd) <= 1.0
+    assert result.shown == "contours"
+    # Holes are flattened along x and y in turn, as the pattern has it.
+    flat = [abs(HoleShape.of(hole).orientation_deg) for _, hole in matched.holes]
+    assert 25 <= np.sum(np.array(flat) < 30.0) <= 35
+
+
+def test_measure_finds_by_itself_that_there_is_no_speckle(
+    photographed: Path, tmp_path: Path
+) -> None:
+    names = [photographed / f"{name}_8bit.tif" for name in ("reference", "deformed_1280")]
+    summary = measure(names[0], names[1:], tmp_path, pixel_size=0.04)
+    (image,) = summary["images"]
+    assert summary["mask"] == "found by its grey level"
+    assert image["shown"] == "contours"
+    assert image["coverage"] > 0.99
+    holes = (tmp_path / "results/deformed_1280_8bit_holes.csv").read_text().splitlines()
+    assert len(holes) == 61
+    assert holes[0].startswith("reference x [mm],reference y up [mm],")
+    assert read_json(tmp_path / "summary.json")["images"] == [image]
+    assert "held to the contours" in (tmp_path / "report.html").read_text()
+
+
+def test_pictures_that_are_not_plain_or_not_whole() -> None:
+    image = disks((132, 132), 15.25, CENTRES, np.array([15.0, 11.0]), 0.3)
+    rng = np.random.default_rng(0)
+    assert plain_surface(rng.random((100, 100), dtype=np.float32)) is None
+    assert plain_surface(np.full((100, 100), 0.3, dtype=np.float32)) is None
+    faint = gaussian_filter(rng.standard_normal(image.shape), 2.0).astype(np.float32)
+    assert plain_surface(image + np.float32(0.01) * rng.standard_normal(image.shape)) is not None
+    assert plain_surface(image + np.float32(0.3) * faint * (image > 0.4)) is None
+    with pytest.raises(InputError, match="all of a specimen without speckle in the picture, got"):
+        plain_surface(image[:, :100])
+    surface = plain_surface(image)
+    assert surface is not None
+    grid = PixelGrid.centred(*image.shape, 1.0)
+    body = FiniteElementOptions().body(surface.mask, grid)
+    with pytest.raises(InputError, match="two grey levels like the reference's"):
+        displacement_of_plain(surface, rng.random(image.shape, dtype=np.float32), grid, body)
+    fewer = disks((132, 132), 15.25, CENTRES[:1], np.array([15.0, 11.0]), 0.3)
+    with pytest.raises(InputError, match="the reference's 4 holes in the deformed picture, found"):
+        displacement_of_plain(surface, fewer, grid, body)
