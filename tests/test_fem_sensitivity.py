@@ -252,7 +252,7 @@ def test_what_it_is_not_made_for() -> None:
             made((BEFORE,), (name,))
     with pytest.raises(InputError, match=r"expected clamped edges for right.y.0., got 'sliding'"):
         made((BEFORE,), ("right.y[0]",), edges="sliding")
-    with pytest.raises(InputError, match=r"at most 60 % of half a ligament, got 0.15 mm of hole 0"):
+    with pytest.raises(InputError, match=r"at most 50 % of half a ligament, got 0.15 mm of hole 0"):
         made((BEFORE,), ("holes.diameter[0,0]",)).at(np.array([0.3]))
     with pytest.raises(InputError, match=r"15 % on the buckled\+ path, got none"):
         made((0.15,), ("amplitude[0]",)).at(np.array([5.0]))

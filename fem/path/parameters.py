@@ -30,7 +30,7 @@ _SMOOTH = re.compile(rf"holes\.{_PART}\[{_DEGREE}, ?{_DEGREE}\]")
 _EDGE = re.compile(rf"(left|right)\.(x|y)\[{_DEGREE}\]")
 _AMPLITUDE = re.compile(r"amplitude\[(\d+)\]")
 _HIGHEST = 6  # degree of a polynomial
-_OPEN = 0.6
+_OPEN = 0.5
 """Share of half a ligament that a hole's edge may move: with more the map of the mesh folds."""
 
 

@@ -253,13 +253,12 @@ class _Cost:
         bounds = np.array([u.bounds for u in self.unknowns.values()])
         if np.any(values <= bounds[:, 0]) or np.any(values >= bounds[:, 1]):
             return nothing
-        try:
-            states = self.states(values)
+        try:  # holes' unknowns may fold the mesh
+            return self.equations_at(self.states(values), values)
         except InputError:
             if not self._states:
                 raise
             return nothing
-        return self.equations_at(states, values)
 
     def equations_at(self, states: Sequence[ModelState], values: FloatArray) -> NormalEquations:
         """Of everything, with the model's states at these values."""
