@@ -33,6 +33,7 @@ from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.measure import measure
+from modeharvest.runs.photographs.pipeline import harvest
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
@@ -214,6 +215,17 @@ def test_measure_finds_by_itself_that_there_is_no_speckle(
     assert holes[0].startswith("reference x [mm],reference y up [mm],")
     assert read_json(tmp_path / "summary.json")["images"] == [image]
     assert "held to the contours" in (tmp_path / "report.html").read_text()
+
+
+def test_harvest_says_what_measures_a_plain_specimen(photographed: Path, tmp_path: Path) -> None:
+    case = tmp_path / "test.toml"
+    names = [photographed / f"{name}_8bit.tif" for name in ("reference", "deformed_1280")]
+    case.write_text(
+        f'[images]\nreference = "{names[0]}"\ndeformed = ["{names[1]}"]\n'
+        "[scale]\npixel_size = 0.04\n[specimen]\ncell_size = 1.9\n"
+    )
+    with pytest.raises(InputError, match=r"got a plain one; .* by 'modeharvest measure'"):
+        harvest(case, tmp_path / "out")
 
 
 def test_pictures_that_are_not_plain_or_not_whole() -> None:

@@ -70,10 +70,8 @@ class NodalResult:
     warnings: tuple[str, ...] = ()
     """Sentences."""
     contradicted: float | None = None
-    """Share of the free edges' nodes where a law changes u significantly; None without a law [-].
-    """
-    shown: str = "speckle"
-    """Or "contours", whose residuals are distances [px] along so many pixels of them."""
+    """Share of free edges' nodes where a law changes u significantly; None without one [-]."""
+    shown: str = "speckle"  # or "contours", of which residuals are distances [px]
     roots: FloatArray | None = None
     """(n, 2, k) whose outer products sum up to the covariance of all nodes [mm]; in no file."""
 

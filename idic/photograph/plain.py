@@ -72,6 +72,43 @@ def plain_surface(image: FloatImage) -> PlainSurface | None:
     InputError if the material reaches the picture's border.
     """
     grey = gaussian_filter(np.asarray(image, dtype=np.float32), _BLUR_PX)
+    found = _two_levels(grey)
+    if found is None:
+        return None
+    bright, middle, step = found
+    border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]])
+    material = large_parts(bright if border.mean() < 0.5 else ~bright, _LEAST_PX2)
+    if not material.any() or _shows_speckle(image, material, step):
+        return None
+    reached = sum(int(side.sum()) for side in (*material[[0, -1]], *material[:, [0, -1]].T))
+    if reached:
+        raise InputError(
+            "expected all of a specimen without speckle in the picture, got material at "
+            f"{reached} px of its border; take it from farther away, or crop nothing"
+        )
+    material = _largest(material | ~large_parts(~material, _LEAST_PX2))
+    contours = _contours(grey - middle, material)
+    if not contours:
+        return None
+    # White noise of the pixels, blurred: its variance at a point times its correlation length.
+    noise = estimated_noise(image, material).sd ** 2 / (2.0 * np.sqrt(np.pi) * _BLUR_PX)
+    return PlainSurface(material, contours, noise / _slope(grey, contours) ** 2)
+
+
+def require_speckle(image: FloatImage, path: Path) -> None:
+    """InputError if a picture (rows, cols), of this file, shows a plain specimen."""
+    if plain_surface(image) is not None:
+        raise InputError(
+            f"expected speckle on the specimen in {path}, got a plain one; measure the "
+            "displacement from its contours, by 'modeharvest measure'"
+        )
+
+
+def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | None:
+    """(rows, cols) where a picture is bright, the middle of its two levels, and their difference.
+
+    None unless these explain most of it.
+    """
     bright = grey > float(threshold_otsu(grey))  # type: ignore[no-untyped-call]
     for _ in range(_ROUNDS):
         if not 0 < bright.sum() < bright.size:
@@ -81,32 +118,19 @@ def plain_surface(image: FloatImage) -> PlainSurface | None:
         bright = grey > 0.5 * (above + below)
     if left.var() > (1.0 - _TWO_LEVELS) * grey.var():
         return None
-    border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]])
-    is_bright = bool(border.mean() < 0.5)  # the material
-    material = large_parts(bright if is_bright else ~bright, int(_LEAST_PX2))
-    edge = np.concatenate([material[0], material[-1], material[:, 0], material[:, -1]])
-    if not material.any():
-        return None
-    if edge.any():
-        raise InputError(
-            "expected all of a specimen without speckle in the picture, got material at "
-            f"{int(edge.sum())} px of its border; take it from farther away, or crop nothing"
-        )
-    material |= ~large_parts(~material, int(_LEAST_PX2))
-    material = _largest(material)
-    contours = []
-    for points in find_contours((grey - 0.5 * (above + below)).astype(np.float64), 0.0):
+    return bright, 0.5 * (above + below), above - below
+
+
+def _contours(signed: FloatArray, material: BoolArray) -> tuple[FloatArray, ...]:
+    """Closed contours (n, 2) at 0 around a material, the longest first."""
+    found = []
+    for points in find_contours(signed.astype(np.float64), 0.0):
         row, col = np.rint(points[len(points) // 2]).astype(int)
         around = np.s_[max(0, row - 2) : row + 3, max(0, col - 2) : col + 3]
         closed = len(points) > 8 and np.allclose(points[0], points[-1])
         if closed and material[around].any() and abs(_area(points)) > _LEAST_PX2:
-            contours.append(points[:-1])
-    contours.sort(key=lambda points: -abs(_area(points)))
-    if not contours or _shows_speckle(image, material, above - below):
-        return None
-    # White noise of the pixels, blurred: its variance at a point times its correlation length.
-    noise = estimated_noise(image, material).sd ** 2 / (2.0 * np.sqrt(np.pi) * _BLUR_PX)
-    return PlainSurface(material, tuple(contours), noise / _slope(grey, contours) ** 2)
+            found.append(points[:-1])
+    return tuple(sorted(found, key=lambda points: -abs(_area(points))))
 
 
 def _largest(material: BoolArray) -> BoolArray:

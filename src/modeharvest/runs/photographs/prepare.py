@@ -17,6 +17,7 @@ import numpy as np
 from modeharvest.idic.local.field import LocalField, read_field, without_distortion
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
 from modeharvest.idic.photograph.material import find_material, window_for
+from modeharvest.idic.photograph.plain import require_speckle
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial, calibrate
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
@@ -298,6 +299,7 @@ def _mask(
 ) -> tuple[BoolArray, Sequence[str]]:
     """Where a photograph shows material, as given or as found, and how it was found."""
     if given is None:
+        require_speckle(photograph.image, photograph.path)
         found = find_material(photograph.image, window)
         return found.mask, found.text
     mask = read_mask(given)
