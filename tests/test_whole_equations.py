@@ -22,6 +22,7 @@ from modeharvest.idic.finite_element.system import Body, SmoothnessRoots, interi
 from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
+from modeharvest.util.elements import shape_functions
 
 
 @pytest.fixture(scope="module")
@@ -205,3 +206,26 @@ def test_continued_pixels_weigh_by_how_wrong_they_are() -> None:
     assert ratios[2] < 1.0
     whole = ImagePair(pair.reference, pair.deformed, pair.grid)
     assert continued_pixels(whole, 0.0, 0.0) is NONE_CONTINUED
+
+
+def test_residuals_alike_over_elements_inflate_the_variance(mesh: Mesh) -> None:
+    """Noise doesn't, unless it is larger than is said."""
+    random, m, k = np.random.default_rng(0), len(mesh.cells), 60
+    xi = random.dirichlet((1.0, 1.0, 1.0), (m, k))[..., :2]
+    N = shape_functions("T6", xi)
+    h = random.standard_normal((m, 1, 2)) + 0.3 * random.standard_normal((m, k, 2))
+    products = h[..., [0, 0, 1]] * h[..., [0, 1, 1]]
+    blocks, body = np.einsum("mkc,mka,mkb->mcab", products, N, N), Body(mesh)
+
+    def found(residual: NDArray[np.float64], noise: float = 1.0) -> float:
+        """Variance that is counted, over that of noise."""
+        pull = np.einsum("mka,mki,mk->mai", N, h, residual)
+        M, free = noise**2 * blocks, np.full(m, 12.0)
+        drawn, alone = (body.samples(M, part, free)[0] for part in (pull, 0.0 * pull))
+        return float(np.sum(drawn**2) / np.sum(alone**2))
+
+    white = random.standard_normal((m, k))
+    assert found(white) == pytest.approx(1.1, abs=0.1)
+    assert found(white, 0.5) == pytest.approx(found(2.0 * white), rel=1e-9)
+    assert found(2.0 * white) == pytest.approx(4.0, abs=0.4)
+    assert found(np.repeat(random.choice([-1.0, 1.0], (m, 1)), k, axis=1)) > 3.0

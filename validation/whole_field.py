@@ -85,10 +85,10 @@ class WholeFieldNumbers:
 
 def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> WholeFieldNumbers:
     """Numbers of a whole displacement on the pixels of a mask, beside a correlation's result."""
-    measured, grid, px = whole.measured, correlated.grid, correlated.grid.pixel_size
-    u = measured.displacement_on(grid)
+    measured, refit, px = whole.measured, whole.refit, correlated.grid.pixel_size
+    u = measured.displacement_on(correlated.grid)
     there = mask & np.isfinite(u[..., 0])
-    by_idic, by_refit = (fit.displacement()[there] for fit in (correlated, whole.refit))
+    by_idic, by_refit = (fit.displacement()[there] for fit in (correlated, refit))
     w = u[there] - by_idic
     return WholeFieldNumbers(
         w_rms_px=rms(w) / px,
@@ -97,9 +97,7 @@ def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> Who
         rms_refit_to_idic_px=rms(by_refit - by_idic) / px,
         sd_px=rms(measured.standard_deviation) / px,
         coverage=float(there.sum() / mask.sum()),
-        modes=tuple(
-            _both_ways(whole.refit, correlated, i) for i in range(len(whole.refit.ansatz.modes))
-        ),
+        modes=tuple(_both_ways(refit, correlated, i) for i in range(len(refit.ansatz.modes))),
         **picked(measured, "cutoff_px unknowns residual_rms library warnings"),
         start=whole.start,
     )
@@ -152,7 +150,6 @@ def compare_whole(
     u = measured.displacement_on(grid)
     error = true - u
     there = mask & np.isfinite(u[..., 0])
-    apart = (refit.displacement() - best.displacement())[mask] / px
     inside = np.abs(error) < _NORMAL_95 * measured.standard_deviation_on(grid)
     labels = np.where(there, regions(mask, grid, specimen), -1)
     places = {name: labels == REGIONS.index(name) for name in REGIONS}
@@ -165,7 +162,7 @@ def compare_whole(
         rms_bulk_px=by_region.get(BULK),
         max_px=float(lengths(error[there]).max()) / px,
         coverage=float(there.sum() / mask.sum()),
-        rms_refit_to_best_fit_px=rms(apart),
+        rms_refit_to_best_fit_px=rms((refit.displacement() - best.displacement())[mask]) / px,
         interval_coverage=float(inside[there].mean()),
         interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in by_region else None,
         mode=_square_mode(refit, specimen.pitch),

@@ -157,9 +157,9 @@ def deviations(
 ) -> Deviations:
     """Estimate what noise and smoothing make of u, and what smoothing has taken from it.
 
-    By noise, A^-1 e for random e of the covariance M times that of the noise, more of it in
-    elements with larger residuals, with what the regularisation allows for where there is no
-    speckle; by smoothing, what a larger weight changes, and the elements' own error.
+    By noise, A^-1 e for random e of the covariance M times that of the noise, more of it where
+    residuals pull more, with what the regularisation allows for where there is no speckle; by
+    smoothing, what a larger weight changes (of long waves less what is put back), and elements.
 
     cutoff : wavelength [mm].
     noise : its standard deviation in the residual [grey levels].
@@ -167,12 +167,13 @@ def deviations(
     unknowns : their effective number.
     """
     mesh, weight, here = at.body.mesh, at.weight(cutoff), at.step(cutoff)
-    factor = at.factor(weight)
-    scale = (at.sums.excess * in_gradient)[:, None, None, None]
-    random = at.body.samples(at.sums.blocks * scale)
-    found = noise * factor.solve(random).reshape(-1, 2, SAMPLES)
+    factor, degrees = at.factor(weight), np.minimum(at.sums.counts, 12.0)
+    pull = (at.gain * at.signal)[:, None, None] * at.sums.gradient
+    blocks = (noise**2 * in_gradient)[:, None, None, None] * at.sums.blocks
+    random, inflation = at.body.samples(blocks, pull, degrees * (1.0 - unknowns / degrees.sum()))
+    found = factor.solve(random).reshape(-1, 2, SAMPLES)
     lost = none = found[..., :0]
-    error, back = interpolation_error(mesh, at.u.reshape(-1, 2)), 0.0
+    taken = share = np.zeros_like(error := interpolation_error(mesh, at.u.reshape(-1, 2)))
     if isinstance(at.prior, Smoothness):  # what a law allows is not known
         lost = factor.solve(at.body.smoothness_samples).reshape(-1, 2, SAMPLES)
         blank = mean_around(mesh, np.repeat(1.0 - at.signal, 6).reshape(-1, 6))
@@ -184,14 +185,18 @@ def deviations(
         noisy = at.R @ found[..., :_SOME].reshape(at.u.size, _SOME)
         both = weight * factor.solve(np.column_stack([at.penalty, noisy]))
         taken, *by_noise = np.moveaxis(both.reshape(-1, 2, 1 + _SOME), 2, 0)
-        parts = taken**2, np.mean(np.square(by_noise), axis=0) + error**2
-        square, variance = (smoothed(mesh, part).sum(axis=1, keepdims=True) for part in parts)
-        back = smoothed(mesh, (square > _STANDS_OUT * variance).astype(float)) * taken
+        variance = np.mean(np.square(by_noise), axis=0) / inflation[:, None] + error**2
+        beyond = smoothed(mesh, taken**2 - _STANDS_OUT * variance).sum(axis=1, keepdims=True)
+        share = smoothed(mesh, (beyond > 0.0).astype(float))
     change = (at.step(cutoff, _STRONGER) - here).reshape(-1, 2)
+    more, again = _STRONGER * weight, change
+    for _ in range(2):  # as much is taken as with the weight used in one step, or more
+        again = at.factor(more).solve(more * (at.R @ again.ravel())).reshape(-1, 2)
+    missing = change + share * (again - change)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
-    sd = Deviations(found, lost, none, error, spread, back)
-    return sd.with_bias(mesh, change, _OF_SLOPES)
+    sd = Deviations(found, lost, none, error, spread, share * taken)
+    return sd.with_bias(mesh, change, _OF_SLOPES)._replace(changes=missing[..., None])
 
 
 def contradicted(

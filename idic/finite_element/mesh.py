@@ -198,9 +198,7 @@ def quadratic(mesh: Mesh) -> Mesh:
 
 def _twice_area(nodes: FloatArray, cells: IntArray) -> FloatArray:
     """(m,) of the triangles of elements' corners, positive if counter-clockwise."""
-    a, b, c = (nodes[cells[:, k]] for k in range(3))
-    d, e = b - a, c - a
-    return np.asarray(d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0])
+    return np.asarray(np.linalg.det(nodes[cells[:, 1:3]] - nodes[cells[:, :1]]))
 
 
 def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:

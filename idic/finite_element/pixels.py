@@ -247,13 +247,6 @@ class NodalEquations:
         """Of r [grey levels]."""
         return float(np.sqrt(self.square_sum / self.pixels))
 
-    @property
-    def excess(self) -> FloatArray:
-        """(m,) mean of r^2 in an element over that in all, if significantly larger; or 1 [-]."""
-        counts = np.maximum(self.counts, 1.0)
-        ratio = self.squares / counts * self.pixels / max(self.square_sum, _TINY)
-        return np.where(ratio > 1.0 + 2.0 * np.sqrt(2.0 / counts), ratio, 1.0)
-
     def signal(self, noise: FloatArray) -> tuple[FloatArray, float]:
         """(m,) share of each element's slopes that is signal, 0 to 1; grad g over h, at least 1.
 

@@ -31,7 +31,7 @@ from scipy.sparse import bsr_array, csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
-from modeharvest.idic.finite_element.fields import nodal_sums
+from modeharvest.idic.finite_element.fields import mean_around, nodal_sums
 from modeharvest.idic.finite_element.pixels import MeshPixels, NodalEquations
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
@@ -233,15 +233,26 @@ class Body:
         weight = (cutoff / self.wavelength) ** Smoothness.power * self.energies(one)
         return self.factor(one, R, weight / self.energies(R)).solve(one @ u.ravel()).reshape(-1, 2)
 
-    def samples(self, blocks: FloatArray) -> FloatArray:
-        """(2 n, SAMPLES) random vectors of the covariance M, given by its blocks."""
-        n, m, count = len(self.mesh.nodes), len(blocks), SAMPLES
-        M = blocks[:, [[0, 1], [1, 2]]].transpose(0, 3, 1, 4, 2).reshape(m, 12, 12)
+    def samples(self, M: FloatArray, pull: FloatArray, free: FloatArray) -> tuple[FloatArray, ...]:
+        """(2 n, SAMPLES) random vectors of the covariance M (m, 3, 6, 6), times (n,) >= 1.
+
+        ``pull`` (m, 6, 2): what there is of them, of (m,) degrees of freedom. What is alike over an
+        element, its own error first of all, pulls its nodes more than noise as large.
+        """
+        n, m, cells = len(self.mesh.nodes), len(M), self.mesh.cells
+        M = M[:, [[0, 1], [1, 2]]].transpose(0, 3, 1, 4, 2).reshape(m, 12, 12)
         # Elements with few pixels have singular blocks.
         M[:, range(12), range(12)] *= 1.0 + 1e-9
         M[:, range(12), range(12)] += 1e-12 * M.max()
-        z = np.linalg.cholesky(M) @ np.random.default_rng(0).standard_normal((m, 12, count))
-        return nodal_sums(n, self.mesh.cells, z.reshape(m, 6, 2 * count)).reshape(2 * n, count)
+        ridge = 1e-4 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(12)
+        moved = np.linalg.solve(M + ridge, pull.reshape(m, 12, 1))[..., 0]
+        square = (pull.reshape(m, 12) * moved).sum(axis=1)
+        own = np.repeat(np.stack([square, free], axis=1)[:, None], 6, axis=1)
+        found, expected = mean_around(self.mesh, own).T
+        inflation = np.maximum(found / np.maximum(expected, 1.0), 1.0)
+        M *= inflation[cells].mean(axis=1)[:, None, None]
+        z = np.linalg.cholesky(M) @ np.random.default_rng(0).standard_normal((m, 12, SAMPLES))
+        return nodal_sums(n, cells, z.reshape(m, 6, -1)).reshape(2 * n, -1), inflation
 
 
 class Smoothness:

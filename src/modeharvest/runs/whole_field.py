@@ -190,15 +190,14 @@ def _measure(
     """Measure images in a folder one after another, from their correlations, by strain."""
     images, law = ImageSet.read(folder), None if how.law is None else how.law.material
 
-    def one(strain: float, result: Result) -> None:
+    def say(of: str, done: float, total: float, what: str) -> None:
+        progress(done, total, f"{what}, {of}")
+
+    for strain, result in results.items():
         of = f"strain {100 * strain:.2f} %"
-
-        def report(done: float, total: float, what: str) -> None:
-            progress(done, total, f"{what}, {of}")
-
         with with_remedy(of):
             pair = images.pair(strain, camera=camera)
-            found = measure_displacement(pair, result, body, options=how, progress=report)
+            found = measure_displacement(pair, result, body, options=how, progress=partial(say, of))
         files.result_path(strain).unlink(missing_ok=True)
         if result.outcome in ASTRAY:
             pair, a = images.pair(strain, camera=correlation.camera), result.unknowns
@@ -207,9 +206,6 @@ def _measure(
             make_folder(files.folder)
             result.write(files.result_path(strain))
         files.write(name_of(strain), found, Given(material=law, correlation=result))
-
-    for strain, result in results.items():
-        one(strain, result)
 
 
 @contextmanager
