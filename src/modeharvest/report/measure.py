@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.report.figures.boundaries import MeshBoundary
-from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
+from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field, draw_image
 from modeharvest.report.model import (
     Card,
     KeyNumber,
@@ -23,11 +23,13 @@ from modeharvest.report.model import (
     number,
     text_of,
 )
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, FloatImage
 
 Summary = Mapping[str, Any]
 Residual = Callable[[str, NodalResult], FloatArray]
 """From an image's name and its result to (rows, cols) [grey levels]."""
+Picture = Callable[[str], FloatImage]
+"""From an image's name to the image (rows, cols), 0 black and 1 white."""
 
 _SHOWN = 4
 """Images with maps of their own, at most: the last ones are spread evenly over the sequence."""
@@ -37,11 +39,12 @@ def measure_report(
     summary: Summary,
     results: Mapping[str, NodalResult] | None = None,
     residual: Residual | None = None,
+    picture: Picture | None = None,
 ) -> Report:
     """The report of a measurement.
 
     ``summary``: the content of ``summary.json``. ``results`` by the images' names, and what gives
-    their ``residual``; without, the report has numbers only, as for the terminal.
+    their ``residual`` and the images; without, the report has numbers only, as for the terminal.
     """
     images = summary["images"]
     by_contours = images[-1]["shown"] == "contours"
@@ -49,9 +52,10 @@ def measure_report(
     names, last = [image["name"] for image in images], images[-1]
     shown = np.unique(np.linspace(len(names) - 1, 0, min(_SHOWN, len(names))).round().astype(int))
     maps = [
-        Section(f"image-{k + 1}", names[k], _cards(k, names[k], results, residual, summary["unit"]))
+        Section(f"image-{k + 1}", names[k],
+                _cards(k, names[k], results, residual, picture, summary["unit"]))
         for k in shown
-    ] if results and residual else []  # fmt: skip
+    ] if results and residual and picture else []  # fmt: skip
     return Report(
         kind="measurement",
         title=summary["title"],
@@ -85,7 +89,12 @@ def measure_report(
 
 
 def _cards(
-    k: int, name: str, results: Mapping[str, NodalResult], residual: Residual, unit: str
+    k: int,
+    name: str,
+    results: Mapping[str, NodalResult],
+    residual: Residual,
+    picture: Picture,
+    unit: str,
 ) -> list[Card]:
     """Maps of one image."""
     result = results[name]
@@ -100,6 +109,9 @@ def _cards(
         field = frame.average(residual(name, result))  # pixels on edges show the background
         return draw_field(frame, field, ColourScale.signed(field, "levels", 0.95), unit=unit)
 
+    def seen() -> Figure:
+        return draw_image(frame, picture(name), None, result.grid, result.displacement)
+
     u, strain = result.displacement, result.field("logarithmic")
     sd = np.linalg.norm(result.standard_deviation, axis=1)
     panels: dict[str, list[tuple[str, Callable[[], Figure]]]] = {
@@ -109,6 +121,7 @@ def _cards(
             for i, j in ((0, 0), (1, 1), (0, 1))
         ],
         "Standard deviation of u, length": [("", partial(nodal, sd, unit, False))],
+        "The image, and the mesh’s edges where they were measured": [("", seen)],
     }
     if result.shown == "speckle":
         panels["Residual f − g(x + u)"] = [("", left)]

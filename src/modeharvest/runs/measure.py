@@ -61,7 +61,7 @@ from modeharvest.imaging.photographs.files import read_mask, require_same_shape,
 from modeharvest.imaging.photographs.photograph import Photograph, read_frame, read_reference
 from modeharvest.runs.photographs.prepare import CODE, LIBRARIES, named_files
 from modeharvest.runs.whole_field import BYTES_PER_PIXEL
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.files import (
     atomic_hdf5,
@@ -277,6 +277,11 @@ class MeasureRun(StagedRun[MeasureCase]):
         """(rows, cols) residual of one image [grey levels], NaN off the material."""
         return residual(self.pair(name), result.displacement_on(), self.case.brightness)
 
+    def picture(self, name: str) -> FloatImage:
+        """(rows, cols) one deformed image, from 0 black to 1 white."""
+        image = read_frame(self.case.files[name], self.reference).image
+        return np.asarray(image / np.float32(self.reference.full_scale))
+
     def all(self) -> dict[str, Any]:
         """Do everything that is not finished; returns the content of ``summary.json``."""
         with exclusive(self.folder):
@@ -286,7 +291,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             from modeharvest.report.measure import measure_report
             from modeharvest.report.model import write_page
 
-            report = measure_report(summary, results, self.residual)
+            report = measure_report(summary, results, self.residual, self.picture)
             write_page(report, self.folder / "report.html", self.progress)
             write_json(self.folder / "summary.json", summary)
         return summary
