@@ -112,7 +112,7 @@ def test_summary(plate: Plate, measured: Path) -> None:
     assert "seconds" not in second
     assert summary["unit"] == "mm"
     page = (measured / "report.html").read_text()
-    assert page.count("<svg") == 2 * 7
+    assert page.count("<svg") == 2 * 8
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
