@@ -242,7 +242,9 @@ def test_pictures_that_are_not_plain_or_not_whole() -> None:
     assert surface is not None
     grid = PixelGrid.centred(*image.shape, 1.0)
     body = FiniteElementOptions().body(surface.mask, grid)
-    with pytest.raises(InputError, match="two grey levels like the reference's"):
+    with pytest.raises(
+        InputError, match="expected two grey levels in the picture, like the reference's"
+    ):
         displacement_of_plain(surface, rng.random(image.shape, dtype=np.float32), grid, body)
     fewer = disks((132, 132), 15.25, CENTRES[:1], np.array([15.0, 11.0]), 0.3)
     with pytest.raises(InputError, match="the reference's 4 holes in the deformed picture, found"):

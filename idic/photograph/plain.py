@@ -69,10 +69,10 @@ class PlainSurface:
     """Variance of a contour's distance times the length over which it is correlated [px^3]."""
 
 
-def plain_surface(image: FloatImage) -> PlainSurface | None:
+def plain_surface(image: FloatImage, name: str = "the picture") -> PlainSurface | None:
     """What a picture (rows, cols) shows if it shows a plain material; None if it has speckle.
 
-    InputError if the material reaches the picture's border.
+    InputError, in which it has a name, if the material reaches the picture's border.
     """
     grey = gaussian_filter(np.asarray(image, dtype=np.float32), _BLUR_PX)
     few = max(1, min(grey.shape) // _COARSE_PX)
@@ -87,7 +87,7 @@ def plain_surface(image: FloatImage) -> PlainSurface | None:
     reached = sum(int(side.sum()) for side in (*material[[0, -1]], *material[:, [0, -1]].T))
     if reached:
         raise InputError(
-            "expected all of a specimen without speckle in the picture, got material at "
+            f"expected all of a specimen without speckle in {name}, got material at "
             f"{reached} px of its border; take it from farther away, or crop nothing"
         )
     material = _largest(material | ~large_parts(~material, _LEAST_PX2))
@@ -101,7 +101,7 @@ def plain_surface(image: FloatImage) -> PlainSurface | None:
 
 def require_speckle(image: FloatImage, path: Path) -> None:
     """InputError if a picture (rows, cols), of this file, shows a plain specimen."""
-    if plain_surface(image) is not None:
+    if plain_surface(image, str(path)) is not None:
         raise InputError(
             f"expected speckle on the specimen in {path}, got a plain one; measure the "
             "displacement from its contours, by 'modeharvest measure'"
@@ -279,17 +279,18 @@ def displacement_of_plain(
     grid: PixelGrid,
     body: Body,
     progress: Progress = silent,
+    name: str = "the picture",
 ) -> tuple[NodalResult, MatchedContours]:
     """The displacement in another picture (rows, cols) of a plain specimen, and its contours.
 
-    ``body``: a mesh of the reference's material. InputError if the picture shows no plain specimen,
-    or another one.
+    ``body``: a mesh of the reference's material. InputError, in which the picture has a name, if it
+    shows no plain specimen, or another one.
     """
-    deformed = plain_surface(image)
+    deformed = plain_surface(image, name)
     if deformed is None:
         raise InputError(
-            "expected two grey levels like the reference's, got a picture with more: a plain "
-            "specimen can't be found in it; light it evenly, or give a mask if it has speckle"
+            f"expected two grey levels in {name}, like the reference's, got more: a plain specimen "
+            "can't be found there; light it evenly, or give a mask if it has speckle"
         )
     matched = matched_contours(reference, deformed, grid)
     start = matched.start(body.mesh.nodes)

@@ -143,7 +143,7 @@ class MeasureRun(StagedRun[MeasureCase]):
     def plain(self) -> PlainSurface | None:
         """The reference's contours where it has no speckle; None if it has, or is masked."""
         of_images = self.case.mask is self.case.mesh is None
-        return plain_surface(self.reference.image) if of_images else None
+        return plain_surface(self.reference.image, str(self.case.reference)) if of_images else None
 
     @cached_property
     def grid(self) -> PixelGrid:
@@ -263,7 +263,12 @@ class MeasureRun(StagedRun[MeasureCase]):
         pair, body = self.pair(name), self._body
         if self.plain is not None:
             found, contours = displacement_of_plain(
-                self.plain, pair.deformed, self.grid, body, self.progress
+                self.plain,
+                pair.deformed,
+                self.grid,
+                body,
+                self.progress,
+                str(self.case.files[name]),
             )
             holes = folder / f"{name}_holes.csv"
             write_holes(holes, contours, self.case.unit)
