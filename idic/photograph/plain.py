@@ -2,7 +2,7 @@
 
 Such a picture has two grey levels, and its information is where they meet. Contours are taken at
 half-way between the levels around, which may vary slowly over the picture, after a blur of less
-than a pixel: a straight edge is then found within noise, one of radius R off by 0.5 px^2/R.
+than a pixel. What blur moves curved edges by, its variance over twice their radius, is put back.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import gaussian_filter, label
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, label
 from scipy.optimize import linear_sum_assignment
 from skimage.filters import threshold_otsu
 
@@ -48,6 +48,10 @@ _INSIDE_PX = 4.0
 _SPECKLE_PX, _LAG_PX = 8.0, 2
 _FAINTEST, _ALIKE_GREY = 0.02, 0.3
 """Speckle is what varies by more than a fiftieth of the step at edges, and is alike 2 px away."""
+_DIFFERENCE_PX2 = 1.0 / 3.0
+"""Variance of the blur that differences over two pixels add."""
+_CURVED_PX = 2.0
+"""Over which the curvature of contours is averaged."""
 _LEAST_PX2 = 60.0
 """Area of a hole or island; smaller ones are dirt."""
 _TURNS_DEG = np.arange(-24.0, 25.0, 6.0)
@@ -94,9 +98,14 @@ def plain_surface(image: FloatImage, name: str = "the picture") -> PlainSurface 
     contours = _contours(grey - middle, material)
     if not contours:
         return None
+    slope = _slope(grey, contours)
     # White noise of the pixels, blurred: its variance at a point times its correlation length.
     noise = estimated_noise(image, material).sd ** 2 / (2.0 * np.sqrt(np.pi) * _BLUR_PX)
-    return PlainSurface(material, contours, noise / _slope(grey, contours) ** 2)
+    # The slope of a straight edge says how far the lens, the pixels and this have blurred it.
+    blur = float(np.abs(step[material]).mean()) / (slope * np.sqrt(2.0 * np.pi))
+    variance = max(0.0, blur**2 - _DIFFERENCE_PX2)
+    sharp = tuple(_unbent(points, variance) for points in contours)
+    return PlainSurface(material, sharp, noise / slope**2)
 
 
 def require_speckle(image: FloatImage, path: Path) -> None:
@@ -174,6 +183,17 @@ def _shows_speckle(image: FloatImage, material: BoolArray, step: FloatArray) -> 
         return False
     alike = np.corrcoef(fine[:, _LAG_PX:][both], fine[:, :-_LAG_PX][both])[0, 1]
     return bool(alike > _ALIKE_GREY)
+
+
+def _unbent(points: FloatArray, variance: float) -> FloatArray:
+    """A contour (n, 2) less what a blur of that variance [px^2] has moved it, 1/2R times that.
+
+    To the centre of curvature, that is; a step back in time of the flow by curvature.
+    """
+    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1).mean()
+    smooth = gaussian_filter1d(points, _CURVED_PX / step, axis=0, mode="wrap")
+    bent = np.roll(smooth, -1, axis=0) - 2.0 * smooth + np.roll(smooth, 1, axis=0)
+    return np.asarray(points - 0.5 * variance / step**2 * bent)
 
 
 def _slope(grey: FloatImage, contours: Sequence[FloatArray]) -> float:
