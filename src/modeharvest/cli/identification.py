@@ -14,7 +14,7 @@ def identify(
         str,
         typer.Argument(
             metavar="EXPERIMENT.toml",
-            help="Model, unknowns and data; or a shipped case: identify-twin.",
+            help="Model, unknowns and data; or a shipped case: identify-twin, identify-paper.",
         ),
     ],
     out: OutFolder,
