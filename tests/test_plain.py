@@ -217,6 +217,18 @@ def test_measure_finds_by_itself_that_there_is_no_speckle(
     assert "held to the contours" in (tmp_path / "report.html").read_text()
 
 
+def test_holes_that_are_not_found_again_leave_a_warning() -> None:
+    holes = CENTRES, np.array([15.0, 11.0]), 0.3
+    surface = plain_surface(disks((132, 132), 15.25, *holes))
+    fewer = disks((132, 132), 15.25, CENTRES[:3], *holes[1:])
+    assert surface is not None
+    grid = PixelGrid.centred(132, 132, 1.0)
+    body = FiniteElementOptions().body(surface.mask, grid)
+    result, matched = displacement_of_plain(surface, fewer, grid, body)
+    assert matched.lost == 1
+    assert any("1 holes weren't found again" in warning for warning in result.warnings)
+
+
 def test_harvest_says_what_measures_a_plain_specimen(photographed: Path, tmp_path: Path) -> None:
     case = tmp_path / "test.toml"
     names = [photographed / f"{name}_8bit.tif" for name in ("reference", "deformed_1280")]

@@ -60,6 +60,7 @@ _LEAST_DET = 0.02
 _CORRELATED_PX = 2.5
 """Length over which the noise of a contour's points is correlated, about."""
 _PROBES = 4
+_ASTRAY = "The displacement from contours didn't converge: don't use it; give pictures in between."
 _TRIANGULAR, _RECTANGULAR = 6.0, 3.0
 """Half-width squared over variance of such distributions: of what is most likely in the middle, and
 of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
@@ -260,8 +261,8 @@ class _PenalisedBody:
             self._factor.update(A)
         return self._factor
 
-    def relax(self, springs: float, tolerance_px: float) -> None:
-        """Newton's method with Levenberg's safeguard to least energy; springs in mu/px."""
+    def relax(self, springs: float, tolerance_px: float) -> bool:
+        """Newton's method, safeguarded as Levenberg's; springs in mu/px. Whether it converged."""
         self.stiffness = springs / self.px
         energy, damping, safe = self.energy(self.u), 1e-3, self._first / self.shear
         for _ in range(_STEPS):
@@ -275,13 +276,14 @@ class _PenalisedBody:
                 if there < energy or damping > 1e3:
                     break
                 damping *= 5.0
-            if there >= energy:
-                return  # to rounding
-            self.u, energy = self.u + step, there
             longest = float(np.linalg.norm(step.reshape(-1, 2), axis=1).max()) / self.px
+            if there >= energy:  # to rounding, or astray
+                return bool(longest * (1.0 + damping) < _ROUGH_PX)
+            self.u, energy = self.u + step, there
             if longest * (1.0 + damping) < tolerance_px:
-                return
+                return True
             damping *= 0.2
+        return False
 
     def pressed_sides(self) -> tuple[IntArray, ...]:
         """The straight edges that something presses or pulls."""
@@ -318,10 +320,7 @@ class _PenalisedBody:
         self.stretched = root * ((along * gaps).sum(axis=1) - length)
 
     def take_up(self, stiffer: float) -> None:
-        """Take up by how much springs, to become so many times stiffer, give way under plates.
-
-        Their traction is no error of the law: they would be compressed by it where noise isn't.
-        """
+        """Take up by how much springs give way under plates once they are so many times stiffer."""
         d, _ = self.edge.distances(self.u.reshape(-1, 2))
         for own in self.pressed:
             self.edge.off[own] -= np.average(d[own], weights=self.edge.length[own]) / stiffer
@@ -364,8 +363,7 @@ def displacement_from_contours(
     """
     state = _PenalisedBody(body, seen, grid, law or ELASTOMER, start)
     soft, stiff = _SPRINGS
-    sides: tuple[IntArray, ...] = ()
-    before = state.u
+    sides, before, converged = tuple[IntArray, ...](), state.u, False
     for stage in counted(range(3), progress, "displacement from contours"):
         if stage == 0:
             state.relax(soft, _ROUGH_PX)
@@ -376,11 +374,10 @@ def displacement_from_contours(
             before = state.u
         else:
             state.take_up(stiff / soft)
-            state.relax(stiff, _TOLERANCE_PX)
+            converged = state.relax(stiff, _TOLERANCE_PX)
     u, mesh = state.u.reshape(-1, 2), body.mesh
     left = np.asarray(state.u - before).reshape(-1, 2) * (soft / (stiff - soft))
     sd, known = _deviations(state, seen.noise, law is None, bool(sides) and not slides, left)
-    used = state.edge.length > 0.0
     d, _ = state.edge.distances(u)
     return NodalResult(
         mesh=mesh,
@@ -397,10 +394,11 @@ def displacement_from_contours(
         residual_noise=float(np.sqrt(seen.noise / _CORRELATED_PX / grid.pixel_size))
         / grid.pixel_size,
         pixels=int(state.edge.length.sum() / grid.pixel_size),
-        outside=int((~used).sum()),
+        outside=int((state.edge.length == 0.0).sum()),
         effective_unknowns=known,
         library="" if state._factor is None else state._factor.library,
         shown="contours",
+        warnings=() if converged else (_ASTRAY,),
     )
 
 

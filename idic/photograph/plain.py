@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -148,9 +148,7 @@ def _contours(signed: FloatArray, material: BoolArray) -> tuple[FloatArray, ...]
 
 def _largest(material: BoolArray) -> BoolArray:
     """The largest island, with its holes."""
-    islands, count = label(material)
-    if count < 2:
-        return material
+    islands, _ = label(material)
     return np.asarray(islands == 1 + np.argmax(np.bincount(islands.ravel())[1:]))
 
 
@@ -314,7 +312,11 @@ def displacement_of_plain(
         )
     matched = matched_contours(reference, deformed, grid)
     start = matched.start(body.mesh.nodes)
-    return displacement_from_contours(matched.seen, body, grid, start, progress=progress), matched
+    found = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
+    if matched.lost:
+        lost = f"{matched.lost} holes weren't found again: what is around them follows from a law."
+        found = replace(found, warnings=(*found.warnings, lost))
+    return found, matched
 
 
 @dataclass(frozen=True)
