@@ -1,17 +1,19 @@
 """Material and tilt identified from images and forces: bias, scatter and coverage over seeds, cost.
 
     scripts/env python benchmarks/identification_statistics.py --seeds 100
-        [--seeds 12 --pixel-size 0.02 --compare] [--fields] [--cost]
+        [--linear] [--seeds 12 --pixel-size 0.02 --compare] [--fields] [--cost]
 
 A small specimen with known parameters, simulated with polynomials of degree 4, is photographed once
 without noise; each seed adds noise to images and forces and identifies from values off by a factor
 of two, by a model on another mesh, of degree 3, whose last steps have the residual of a third mesh
-of degree 4. A dask campaign: what is stopped goes on. ``--compare``: also by updating the same
-model from displacements that were measured first, as the whole displacement (finite-element DIC
-without a law, started at the best fit of the ansatz) and by pyvale's subsets (MODEHARVEST_PYVALE
-names a Python that has it). ``--fields``: from exact displacements and forces of a fine mesh, by
-coarser ones: the error by the mesh. ``--cost``: what the model's states cost, with and without
-derivatives, along the whole path and from states nearby, of this specimen and of the paper's.
+of degree 4. A dask campaign: what is stopped goes on. ``--linear``: from the true values, by
+states that are linear about them, which is a small part of the work. ``--compare``: also by
+updating the same model from displacements that were measured first, as the whole displacement
+(finite-element DIC without a law, started at the best fit of the ansatz) and by pyvale's subsets
+(MODEHARVEST_PYVALE names a Python that has it). ``--fields``: from exact displacements and forces
+of a fine mesh, by coarser ones: the error by the mesh. ``--cost``: what the model's states cost,
+with and without derivatives, along the whole path and from states nearby, of this specimen and of
+the paper's.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import argparse
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,21 +31,31 @@ import numpy as np
 import pandas as pd
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.field import Snapshot, Solution
-from modeharvest.fem.path.parametric import ParametricTest
+from modeharvest.fem.field import Mesh, Snapshot, Solution
+from modeharvest.fem.path.parametric import ParametricState, ParametricTest
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.finite_element.identify import FinerMesh, Readings, Unknown, identify
+from modeharvest.idic.finite_element.identify import (
+    LEVELS,
+    FinerMesh,
+    Model,
+    Readings,
+    Unknown,
+    identify,
+)
 from modeharvest.idic.finite_element.measure import measure_displacement
+from modeharvest.idic.finite_element.model_error import corrections
 from modeharvest.idic.finite_element.observed import FieldData, ImageData
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.subsets import SubsetOptions, subset_field
 from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.runs.identification.pipeline import error_ratio
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import read_json, write_json
 from modeharvest.validation.campaign import Campaign
@@ -59,9 +71,8 @@ UNKNOWNS = {
     "kappa": Unknown(10.8, (0.5, 100.0)),
     "tilt": Unknown(0.0, (-0.2, 0.2)),
 }
+TRUTH = np.array(list(TRUE.values()))
 NOISE, FORCE_NOISE = 0.01, 0.005
-ERROR_RATIO = 0.06
-"""Of the finer mesh to the model's, as in modeharvest.runs.identification.pipeline."""
 IMAGES, WHOLE, SUBSETS = "images", "whole displacement", "subsets"
 SUBSET = SubsetOptions(subset_px=21, step_px=5, threads=1)
 
@@ -73,13 +84,14 @@ def main() -> None:
     parser.add_argument("--finer-mesh", type=float, default=0.25, help="[mm]")
     parser.add_argument("--twin-mesh", type=float, default=0.2, help="[mm]")
     parser.add_argument("--pixel-size", type=float, default=0.03, help="[mm/px]")
+    parser.add_argument("--tilt", type=float, default=0.0, help="of the fields [rad]")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("out/identification"))
-    for name in ("compare", "fields", "cost"):
+    for name in ("compare", "fields", "cost", "linear"):
         parser.add_argument(f"--{name}", action="store_true")
     how = parser.parse_args()
     if how.fields:
-        by_mesh()
+        by_mesh(how.tilt)
     elif how.cost:
         costs()
     else:
@@ -92,35 +104,62 @@ def made(size: float, degree: int = 3, names: tuple[str, ...] = tuple(TRUE)) -> 
     return ParametricTest.meshed(experiment, names, degree)
 
 
-def finer_mesh(size: float, degree: int = 4) -> FinerMesh:
-    """What has the last word."""
-    fine = made(size, degree)
-    return FinerMesh(lambda values: fine.near(values, False), ERROR_RATIO)
+def finer_mesh(
+    size: float, mesh: float, linear_on: Mesh | None = None, degree: int = 4
+) -> FinerMesh:
+    """What has the last word after elements of another size."""
+    fine, ratio = made(size, degree), error_ratio(size / mesh)
+    if linear_on is not None:
+        return FinerMesh(linearised(fine, TRUTH, linear_on), ratio)
+    return FinerMesh(lambda values: fine.near(values, False), ratio)
 
 
-def by_mesh() -> None:
+def linearised(test: ParametricTest, values: FloatArray, mesh: Mesh | None = None) -> Model:
+    """The states of values nearby, linear about these; on another mesh if it is given."""
+    states = test.at(values)
+    if mesh is not None:
+        own, nodes = test.mesh, mesh.nodes
+        states = [
+            replace(s, mesh=mesh, nodes_by=s.nodes_by[:0],
+                    displacement=nodal_values(own, s.displacement, nodes, beside=True),
+                    displacement_by=np.array([
+                        nodal_values(own, by, nodes, beside=True) for by in s.displacement_by
+                    ])) for s in states
+        ]  # fmt: skip
+
+    def near(others: FloatArray) -> list[ParametricState]:
+        by = others - values
+        return [
+            replace(s, displacement=s.displacement + np.tensordot(by, s.displacement_by, 1),
+                    force=s.force + float(by @ s.force_by)) for s in states
+        ]  # fmt: skip
+
+    return near
+
+
+def by_mesh(tilt: float) -> None:
     """Print what models of several meshes make of the states of a fine one."""
     fine, (x, y) = made(0.15, 4), np.mgrid[-4.7:4.7:0.06, -4.2:4.2:0.06].reshape(2, -1)
-    states = fine.at(np.array([*list(TRUE.values())[:3], 0.0]), False)
+    states = fine.at(np.append(TRUTH[:3], tilt), False)
     points = np.column_stack([x, y])
     hole = SPECIMEN.pitch * (np.round(points / SPECIMEN.pitch - 0.5) + 0.5)  # the nearest one
     points = points[np.linalg.norm(points - hole, axis=1) > 0.5 * SPECIMEN.diameter + 0.02]
     fields = [nodal_values(fine.mesh, s.displacement, points) for s in states]
     forces = Readings(np.array([s.force for s in states]), 0.002)
     print("| degree | elements [mm] | degree and elements of the finer mesh | modulus | exponent "
-          "| kappa | residual, last state [um] | seconds |")  # fmt: skip
-    print("|---" * 8 + "|")
+          "| kappa | tilt | residual, last state [um] | seconds |")  # fmt: skip
+    print("|---" * 9 + "|")
     for degree, size, finer in (
         (2, 0.35, None), (2, 0.2, None), (2, 0.12, None), (3, 0.35, None), (3, 0.25, None),
         (3, 0.35, (4, 0.25)), (3, 0.35, (4, 0.2)), (3, 0.25, (4, 0.2)),
     ):  # fmt: skip
         begin, model = time.process_time(), made(size, degree)
         data = [FieldData(points, u, 5e-4, model.mesh) for u in fields]
-        last = None if finer is None else finer_mesh(finer[1], finer[0])
+        last = None if finer is None else finer_mesh(finer[1], size, degree=finer[0])
         found = identify(model.near, data, UNKNOWNS, pixel_size=0.03, forces=forces, finer=last)
         residual = 1e3 * found.state_equations[-1].residual
         # The last word itself, not what is extrapolated from it.
-        row = (f"{v:.4g}" for v in (*(found.values - found.mesh_error)[:3], residual))
+        row = (f"{v:.4g}" for v in (*(found.values - found.mesh_error), residual))
         seconds = time.process_time() - begin
         print("|", degree, "|", size, "|", finer or "", "|", " | ".join(row), "|",
               f"{seconds:.0f} |", flush=True)  # fmt: skip
@@ -156,7 +195,7 @@ def by_seed(how: argparse.Namespace) -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
     twin = f"twin-{how.twin_mesh:g}-{how.pixel_size:g}"
     make_twin(how.folder / twin, how.twin_mesh, how.pixel_size)
-    base = {"mesh": how.mesh, "finer": how.finer_mesh, "twin": twin}
+    base = {"mesh": how.mesh, "finer": how.finer_mesh, "twin": twin, "linear": how.linear}
     base["methods"] = [IMAGES, WHOLE, SUBSETS] if how.compare else [IMAGES]
     cases = tuple({**base, "seed": seed} for seed in range(how.seeds))
     campaign = Campaign(FUNCTION, cases, how.folder.resolve())
@@ -171,6 +210,9 @@ def by_seed(how: argparse.Namespace) -> None:
     for method in base["methods"]:
         for name, true in TRUE.items():
             print(row_of(done, method, name, true))
+    p = done["p"]
+    print(f"\nTest of the model: p below 5 % in {int((p < 0.05).sum())} of {len(p)}, median "
+          f"{p.median():.2g}")  # fmt: skip
     print(f"\n{len(done)} seeds; {done['seconds'].mean():.1f} s of processor and "
           f"{done['evaluations'].mean():.1f} evaluations of the model for a seed; outcomes "
           f"{sorted(set(done['outcome']))}")  # fmt: skip
@@ -193,7 +235,7 @@ def make_twin(folder: Path, size: float, pixel_size: float) -> None:
     if (folder / "forces.json").exists():
         return
     twin = made(size, 4)
-    states = twin.at(np.array(list(TRUE.values())), False)
+    states = twin.at(TRUTH, False)
     snapshots = tuple(
         Snapshot(e, s.displacement, s.force, branch=s.branch)
         for e, s in zip(STRAINS, states, strict=True)
@@ -209,24 +251,28 @@ class Setting:
 
     images: ImageSet
     forces: FloatArray
-    model: ParametricTest
+    mesh: Mesh
+    model: Model
     finer: FinerMesh
     pixels: MeshPixels
+    corrections: FloatArray
 
 
 @cache
-def setting(twin: Path, mesh: float, finer: float) -> Setting:
+def setting(twin: Path, mesh: float, finer: float, linear: bool) -> Setting:
     """Made once in a worker."""
     model = made(mesh)
     return Setting(
-        ImageSet.read(twin), np.array(read_json(twin / "forces.json")), model,
-        finer_mesh(finer), MeshPixels(model.mesh),
+        ImageSet.read(twin), np.array(read_json(twin / "forces.json")), model.mesh,
+        linearised(model, TRUTH) if linear else model.near,
+        finer_mesh(finer, mesh, model.mesh if linear else None),
+        MeshPixels(model.mesh), corrections(model.mesh.nodes, SPECIMEN.vectors),
     )  # fmt: skip
 
 
 def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """What is identified from the images and readings of one seed, by each method."""
-    known = setting(folder / case["twin"], case["mesh"], case["finer"])
+    known = setting(folder / case["twin"], case["mesh"], case["finer"], case["linear"])
     images, rng = known.images, np.random.default_rng(case["seed"])
     exact = (images.reference(), *(images.deformed(e) for e in STRAINS))
     f, *deformed = (i + rng.normal(0.0, NOISE, i.shape) for i in exact)
@@ -235,6 +281,8 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     forces = Readings(readings, force_sd)
     pairs = [images.pair(e).with_images(f, g) for e, g in zip(STRAINS, deformed, strict=True)]
     row: dict[str, Any] = {}
+    initial = TRUE if case["linear"] else {n: u.start for n, u in UNKNOWNS.items()}
+    unknowns = {n: Unknown(initial[n], u.bounds) for n, u in UNKNOWNS.items()}
     for method in case["methods"]:
         begin = time.process_time()
         if method == IMAGES:
@@ -243,10 +291,11 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         else:
             measure = whole if method == WHOLE else by_subsets
             measured = (measure(pair) for pair in pairs)
-            data = [FieldData(x, u, sd, known.model.mesh) for x, u, sd in measured]
+            data = [FieldData(x, u, sd, known.mesh) for x, u, sd in measured]
         found = identify(
-            known.model.near, data, UNKNOWNS, pixel_size=images.grid.pixel_size, forces=forces,
-            finer=known.finer,
+            known.model, data, unknowns, pixel_size=images.grid.pixel_size, forces=forces,
+            levels=(FULL,) if case["linear"] else LEVELS, finer=known.finer,
+            corrections=known.corrections if method == IMAGES else None,
         )  # fmt: skip
         parts = zip(TRUE, found.values, found.sd, found.sd_with_model_error, strict=True)
         for name, *numbers in parts:
@@ -254,6 +303,8 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
                 row[f"{method} {name} {what}"] = float(number)
         if method == IMAGES:
             row["seconds"] = time.process_time() - begin
+            assert found.model_error is not None
+            row["p"] = found.model_error.p_value
             row["evaluations"], row["outcome"] = found.evaluations, found.minimum.outcome.value
     return row
 

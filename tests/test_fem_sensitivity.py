@@ -29,9 +29,13 @@ FINER = mesh_specimen(SMALL, 0.4)
 
 
 def made(
-    strains: tuple[float, ...], names: tuple[str, ...], mesh: Mesh = MESH, **how: object
-) -> ParametricTest:
-    return ParametricTest(Experiment(SMALL, strains=strains, mesh_size=0.6, **how), names, mesh)  # type: ignore[arg-type]
+    strains: tuple[float, ...], names: tuple[str, ...], mesh: Mesh = MESH,
+    with_critical: bool = False, **how: object,
+) -> ParametricTest:  # fmt: skip
+    experiment = Experiment(SMALL, strains=strains, mesh_size=0.6, **how)  # type: ignore[arg-type]
+    test = ParametricTest(experiment, names, mesh)
+    test.with_critical = with_critical
+    return test
 
 
 def require_derivatives(test: ParametricTest, values: np.ndarray) -> None:
@@ -196,12 +200,81 @@ def test_moduli_and_another_material() -> None:
     require_derivatives(test, np.array([0.55, 0.3, 55.0]))
 
 
-def test_parameters_are_identified_from_a_state_beside_the_bifurcation() -> None:
-    """1 % beyond it, where u goes with the root of the strain: its amplitude is an unknown, too."""
+def test_the_critical_strain_answers_to_every_parameter() -> None:
+    """By differences of whole simulations; what breaks the symmetry counts as far as it keeps it.
+
+    Steps as above; a critical strain is located to some 1e-10.
+    """
+    names = ("exponents[0]", "kappa", "holes.diameter[0,0]", "right.x[2]", "travel", "tilt")
+    holes = tuple(f"holes[{k}].diameter" for k in range(16))
+    values = np.append([3.0, 5.4, 0.02, 0.05, 1.01], np.zeros(17))
+    test = made((BEFORE,), names + holes, with_critical=True)
+    _, state = test.at(values)
+    assert (state.branch, state.strain) == ("critical", pytest.approx(test.critical_strain / 1.01))
+    for k in range(5):
+        step, found = np.eye(22)[k] * 3e-4 * max(abs(values[k]), 0.1), []
+        for sign in (1.0, -1.0):
+            test.at(values + sign * step, False)
+            found.append(test.critical_strain / (values + sign * step)[4])
+        slope = (found[0] - found[1]) / (2.0 * step[k])
+        assert state.strain_by[k] == pytest.approx(slope, rel=5e-5)
+    assert abs(state.strain_by[5]) < 1e-7
+    assert state.strain_by[6:].sum() == pytest.approx(state.strain_by[2], rel=1e-4)
+    scattered = values + np.append(np.zeros(6), np.linspace(-1e-4, 2e-4, 16))
+    expected = state.strain + state.strain_by[6:] @ scattered[6:]
+    assert test.at(scattered, False)[-1].strain == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_critical_point_nearby_is_that_of_the_whole_path() -> None:
+    names = ("exponents[0]", "kappa", "holes.diameter[0,0]", "tilt")
+    values = np.array([3.0, 5.4, 0.02, 0.01])
+    test, other = (made((BEFORE,), names, with_critical=True) for _ in range(2))
+    for change in (0.0, 1e-3, 0.02):
+        near, whole = (find(values * (1.0 + change))[-1] for find in (test.near, other.at))
+        assert near.strain == pytest.approx(whole.strain, abs=1e-9)
+        off = np.abs(near.strain_by - whole.strain_by)
+        assert np.all(off < 1e-4 * np.abs(whole.strain_by) + 1e-7)
+        np.testing.assert_allclose(near.displacement, whole.displacement, rtol=0, atol=1e-6)
+
+
+def test_the_critical_strain_is_a_datum() -> None:
+    """Beside a state before it: what is known adds up as of independent data."""
+    names, exact, sd = ("kappa", "holes.diameter[0,0]"), np.array([5.4, 0.02]), 1e-3
+    test = made((BEFORE,), names, with_critical=True)
+    true, critical = test.at(exact, False)
+    noise = np.random.default_rng(0).normal(0.0, sd, MESH.nodes.shape)
+    data = [FieldData(MESH.nodes, true.displacement + noise, sd, MESH), None]
+    unknowns = {
+        "kappa": Unknown(4.4, (0.5, 100.0)),
+        "holes.diameter[0,0]": Unknown(0.0, (-0.1, 0.1)),
+    }
+    found = []
+    for reading in (np.nan, critical.strain):
+        strains = Readings(np.array([BEFORE, reading]), np.array([1e-5, 1e-5]))
+        found.append(identify(test.near, data, unknowns, pixel_size=0.03, strains=strains))
+    without, known = found
+    assert np.all(np.abs(known.values - exact) < 4.0 * known.sd)
+    slope = known.states[1].strain_by / 1e-5
+    information = np.linalg.inv(without.covariance) + np.outer(slope, slope)
+    np.testing.assert_allclose(known.sd, np.sqrt(np.diag(np.linalg.inv(information))), rtol=0.1)
+    assert known.sd[1] < 0.7 * without.sd[1]
+    assert known.states[1].strain == pytest.approx(critical.strain, abs=3e-5)
+    with pytest.raises(InputError, match=r"expected buckling up to 0\.06, got none"):
+        made((0.03,), names, with_critical=True).at(exact)
+
+
+@pytest.mark.parametrize(("beyond", "start"), [(1e-3, 3.5), (1e-4, 2.0), (1e-5, 2.0)])
+def test_parameters_are_identified_from_a_state_beside_the_bifurcation(
+    beyond: float, start: float
+) -> None:
+    """Where u goes with the root of the strain: its amplitude is an unknown, too.
+
+    With a prescribed strain the last one ends at an exponent of 1.93 ± 0.04.
+    """
     critical = made((BEFORE,), ("amplitude[0]",))
     critical.at(np.array([0.01]), with_derivatives=False)
     assert critical.critical_strain is not None
-    strains, sd = (BEFORE, critical.critical_strain + 1e-3), 1e-3
+    strains, sd = (BEFORE, critical.critical_strain + beyond), 1e-3
     true = made(strains, ("kappa",)).at(np.array([5.4]), with_derivatives=False)
     noise = np.random.default_rng(0).normal(0.0, sd, (2, *MESH.nodes.shape))
     data = [
@@ -210,9 +283,9 @@ def test_parameters_are_identified_from_a_state_beside_the_bifurcation() -> None
     ]
     test = made(strains, ("exponents[0]", "kappa", "amplitude[1]"))
     unknowns = {
-        "exponents[0]": Unknown(3.5, (0.5, 10.0)),
+        "exponents[0]": Unknown(start, (0.5, 10.0)),
         "kappa": Unknown(4.4, (0.5, 100.0)),
-        "amplitude[1]": Unknown(0.05, (1e-4, 1.0)),
+        "amplitude[1]": Unknown(0.05, (-1.0, 1.0)),
     }
     readings = Readings(np.array(strains), 1e-5)
     found = identify(test.at, data, unknowns, pixel_size=0.03, strains=readings)

@@ -26,7 +26,11 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.report.identification import identification_report
 from modeharvest.runs.case import Case
 from modeharvest.runs.identification.case import IdentificationCase
-from modeharvest.runs.identification.pipeline import _path_warnings, run_identification
+from modeharvest.runs.identification.pipeline import (
+    IdentificationRun,
+    _path_warnings,
+    run_identification,
+)
 from modeharvest.util.errors import InputError
 
 SPECIMEN = {"holes_x": 4, "holes_y": 2, "diameter": 1.5, "bulk_x": 0.9, "bulk_y": 0.4}
@@ -37,10 +41,11 @@ BEFORE: dict[str, Any] = {
                  "kappa": {"start": 2.7, "bounds": [0.5, 50.0]},
                  "tilt": {"start": 0.0, "bounds": [-0.5, 0.5]}},
     "finer_mesh_size": 0.45,
-    "twin": {"mesh_size": 0.5, "tilt": 0.1, "force_sd": 0.002, "force_seed": 3},
+    "twin": {"mesh_size": 0.5, "tilt": 0.1, "force_sd": 0.002, "force_seed": 5},
     "imaging": {"pixel_size": 0.05, "margin_px": 10,
                 "sensor": {"read_noise": 0.01, "read_seed": 5}},
 }  # fmt: skip
+FIELDS = {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0}
 FORCES = {"forces_N_per_mm": [0.2, 0.3], "force_sd": 0.002}
 
 
@@ -217,6 +222,74 @@ def test_every_key_of_the_summary_is_documented(run: tuple[Path, dict[str, Any]]
     assert undocumented(run[1], "identification.md") == set()
 
 
+SMALL = {"holes_x": 4, "holes_y": 4, "diameter": 1.6, "bulk_x": 0.9, "bulk_y": 0.4}
+"""Buckles at about 8 %."""
+
+
+@pytest.mark.dolfinx
+def test_the_frames_of_a_film_bracket_the_critical_strain(tmp_path: Path) -> None:
+    """One photograph long before it, and a film that shows between which 0.1 % it is."""
+    experiment = {"specimen": SMALL, "strains": [0.05], "mesh_size": 0.55}
+    twin = BEFORE["twin"] | {"frame_strain": 0.001, "tilt": 0.02}
+    summary = run_identification(BEFORE | {"experiment": experiment, "twin": twin}, tmp_path)
+    assert (summary["outcome"], summary["warnings"]) == ("converged", [])
+    require_truth(summary)
+    critical = summary["critical_strain"]
+    assert critical["measured"] == pytest.approx(0.0785)
+    assert critical["measured_sd"] == pytest.approx(0.001 / np.sqrt(12.0))
+    assert abs(critical["value"] - critical["measured"]) < 0.7e-3
+    assert 0.0 < critical["sd"] < 1e-4
+    assert len(summary["states"]) == 1
+    assert undocumented(summary, "identification.md") == set()
+
+
+@pytest.mark.dolfinx
+def test_images_of_the_other_branch_are_noticed(tmp_path: Path) -> None:
+    """The pattern's mirror image is that of the other branch, whatever the case names."""
+    experiment = {"specimen": SMALL, "strains": [0.1], "mesh_size": 0.55}
+    twin = BEFORE["twin"] | {"tilt": 0.01}
+    other = BEFORE | {"experiment": experiment | {"branches": ["buckled-"]}, "twin": twin}
+    true = run_identification(other, tmp_path / "true")
+    images = ImageSet.read(tmp_path / "true" / "images")
+    records = images.info["reference"], *images.info["snapshots"]
+    for name, record in zip("fg", records, strict=True):
+        image = read_image(images.folder / record["camera_image"])
+        write_image(tmp_path / f"{name}.tif", image)
+    readings = json.loads((tmp_path / "true" / "forces.json").read_text("utf-8"))
+    data = {"reference": "f.tif", "deformed": ["g.tif"], "pixel_size": 0.05,
+            "force_sd": 0.002, **readings}  # fmt: skip
+    tables = {key: value for key, value in BEFORE.items() if key not in ("twin", "imaging")}
+    case = IdentificationCase.model_validate(tables | {"experiment": experiment, "data": data})
+    case._base = tmp_path
+    found = run_identification(case, tmp_path / "found")
+    assert "the specimen is on buckled-: on buckled+ the model fits worse" in found["statements"]
+    assert [s["branch"] for s in found["states"]] == ["buckled-"]
+    assert found["warnings"] == true["warnings"] == []
+    for p, same in zip(found["parameters"][:3], true["parameters"], strict=True):
+        assert abs(p["value"] - same["value"]) < p["sd"]  # which has the place as unknowns, too
+
+
+@pytest.mark.parametrize(("branch", "travel"), [("buckled+", 1.0), ("buckled-", 1.01)])
+def test_states_beside_the_critical_point_get_an_amplitude(branch: str, travel: float) -> None:
+    """Those within 100 standard deviations of their strains, of the branch that is named."""
+    strains = (0.06, 0.0795, 0.0801, 0.09)
+    data = {**FIELDS, "strain_sd": 1e-5}
+    case = IdentificationCase.model_validate({
+        "experiment": {"strains": strains, "branches": [branch]},
+        "unknowns": BEFORE["unknowns"], "data": data,
+    })  # fmt: skip
+    unknowns = {"travel": None, "amplitude[2]": None}
+    found: Any = SimpleNamespace(
+        unknowns=unknowns, minimum=SimpleNamespace(unknowns=np.array([travel, 0.1]))
+    )
+    fine = SimpleNamespace(critical_strain=0.08 * travel, experiment=case.experiment)
+    near = IdentificationRun(case, Path())._beside_critical(found, fine)
+    assert list(near) == ["amplitude[1]"]
+    assert np.sign(near["amplitude[1]"].start) == (1.0 if branch == "buckled+" else -1.0)
+    fine.critical_strain = None
+    assert IdentificationRun(case, Path())._beside_critical(found, fine) == {}
+
+
 @pytest.mark.dolfinx
 def test_several_laws_are_compared_by_their_evidence(tmp_path: Path) -> None:
     """Before buckling two laws that fit are not told apart, and one too hard to compress is."""
@@ -263,10 +336,12 @@ def test_omitted_terms_begin_beyond_linear_elasticity() -> None:
 
 
 def test_evidence_in_words() -> None:
-    text = compared_by_evidence(["Ogden", "I1"], [(-90.0, 0.5), (-100.0, 1.0)])
+    text = compared_by_evidence(["Ogden", "I1"], [(-90.0, 0.5), (-100.0, 1.0)], ["I1"])
     assert text.startswith("evidence for Ogden against I1 is decisive (the logarithm of")
-    text = compared_by_evidence(["Ogden", "I1"], [(-100.0, 3.0), (-98.0, 0.0)])
+    assert text.endswith("at least)")
+    text = compared_by_evidence(["Ogden", "I1"], [(-100.0, 3.0), (-98.0, 0.0)], ["I1"])
     assert text.startswith("I1 and Ogden are not distinguishable (the logarithm")
+    assert text.endswith("; but the tests reject I1 itself: it is the least wrong of these")
 
 
 def test_the_shipped_case_is_one() -> None:
@@ -304,6 +379,8 @@ def test_the_shipped_case_is_one() -> None:
         ({"data": {"reference": "f.tif", "deformed": ["g.tif", "h.tif"], "pixel_size": 0.1,
                    "light_degree": 9}}, "data: expected light_degree of 0 to 6, got 9"),
         ({"twin": None}, "expected a table [data] or a table [twin]"),
+        ({"data": {**FIELDS, "critical_strain": [0.08, 0.07]}},
+         "expected critical_strain = [low, high] above 0, got [0.08, 0.07]"),
         ({"laws": [{"name": "Ogden", "material": {"kind": "ogden"}, "unknowns": {}}]},
          "laws: expected names that differ, got ['Ogden', 'Ogden']"),
         ({"laws": [{"name": "a", "material": {"kind": "foam"}, "unknowns": {}}]},

@@ -26,7 +26,7 @@ from modeharvest.fem.path.bifurcation import Critical, follow_branch, locate_cri
 from modeharvest.fem.path.continuation import BranchPoint, PathFollower, State, load_at, value_at
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.factor import BodyFactor
-from modeharvest.fem.path.newton import Constraint
+from modeharvest.fem.path.newton import Constraint, path_tangent
 from modeharvest.fem.path.parameters import TILT, TRAVEL, holes_of, parameter, require_open
 from modeharvest.fem.path.sensitivity import (
     OMITTED,
@@ -36,16 +36,18 @@ from modeharvest.fem.path.sensitivity import (
     sensitivities,
     with_omitted_terms,
 )
+from modeharvest.fem.path.stability import Mode
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _SIGNS = {"buckled+": 1, "buckled-": -1}
 _SHORTEST = 1 / 64  # of what breaks the symmetry, or of an amplitude, in one step
 _NO_PATTERN = 1e-6  # overlap of a mode with the pattern [-], or its amplitude [mm]
-_BEYOND = 2.0  # times the last strain: where to look for a critical point at most
+_AHEAD, _BEYOND = 1.02, 2.0  # times the last strain: how far to look for a critical point
 _ATTEMPTS = 3  # with shorter and shorter steps
 _OFF, _JUMP = 0.5, 0.05
 """Most by which a state may be off its prediction: of the step to that, or of all its u."""
+_BELOW = 1.0 - 1e-6  # of the displacement at a critical point: so near, derivatives are its own
 _KEPT = 0.3  # of a buckled state's pattern, at least, in one step
 
 
@@ -54,7 +56,7 @@ class ParametricState:
     """An equilibrium state of a test, and its derivatives by the test's ``names``."""
 
     strain: float
-    """Nominal [-]: that of the test times the travel, or what the amplitude makes it."""
+    """Nominal [-]: that of the test, or what the amplitude makes it, over the travel."""
     mesh: Mesh
     """The undeformed one, with its holes where the parameters put them."""
     displacement: FloatArray
@@ -103,16 +105,17 @@ class ParametricTest:
         comm = MPI.COMM_SELF
         self.structure = Structure(mesh, experiment.material, loading, comm, True, degree)
         self.experiment, self.names, self.mesh = experiment, tuple(names), self.structure.shown
+        self.with_critical = False  # whether the critical state comes last
         self._nodes, self._degree = mesh.nodes, degree
         self._parameters = {name: parameter(name, experiment) for name in (*names, TILT)}
         self._variations = {name: self._variation(name) for name in self._parameters}
+        self._moved = {n: self.structure.on_shown(v.nodes) for n, v in self._variations.items()}
         self._follower = PathFollower(self.structure, experiment.path)
         pattern = self.structure.from_function(spec.pattern)
         weighted = self._follower.mass * pattern
         square = float(weighted.dot(pattern))
         self._weights, self._norm = (1.0 / square) * weighted, float(np.sqrt(square))
-        self.critical_strain: float | None = None
-        """Of the last values whose path was followed, if there is a bifurcation [-]."""
+        self._critical: Critical | None = None
         self._last: tuple[FloatArray, list[_Known]] | None = None
 
     @classmethod
@@ -123,6 +126,11 @@ class ParametricTest:
         spec = experiment.specimen
         mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
         return cls(experiment, names, mesh, degree)
+
+    @property
+    def critical_strain(self) -> float | None:
+        """Of the last values whose path was followed, if there is a bifurcation [-]."""
+        return None if self._critical is None else self._critical.strain
 
     @property
     def own_values(self) -> FloatArray:
@@ -150,8 +158,7 @@ class ParametricTest:
                 state, factor = self._bent(state, first, late, weights), self._factor
             by = self._by(state, k, travel, weights, factor) if with_derivatives else ()
             known.append(_Known(state, branch, by))
-        self._last = np.array(values), known
-        return [self._result(*one) for one in known]
+        return self._results(values, known)
 
     def near(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
         """The same, in one step from the states found last where that leads to their branches.
@@ -178,17 +185,50 @@ class ParametricTest:
             if state is None or state.negative_pivots > before.state.negative_pivots:
                 return self.at(values, with_derivatives)
             step, size = (guess - before.state.u).norm(), before.state.u.norm()
-            if (state.u - guess).norm() > max(_OFF * step, _JUMP * size):
-                return self.at(values, with_derivatives)
+            is_far = (state.u - guess).norm() > max(_OFF * step, _JUMP * size)
             was, now = (float(self._weights.dot(s.u)) for s in (before.state, state))
             is_lost = now * np.sign(was) < max(_KEPT * abs(was), _NO_PATTERN)
-            if before.branch != "primary" and amplitude is None and is_lost:
+            if is_far or (before.branch != "primary" and amplitude is None and is_lost):
                 return self.at(values, with_derivatives)
             weights = None if amplitude is None else self._weights
             by = self._by(state, k, travel, weights, self._factor) if with_derivatives else ()
             known.append(_Known(state, before.branch, by))
+        if self.with_critical:  # always by the whole primary path, which is exactly symmetric
+            self._vary(first)
+            most, name = (
+                _BEYOND * travel * max(self.experiment.strains),
+                self.experiment.branches[0],
+            )
+            _, self._critical = self._primary(most, (), name)
+            if self._critical is None:
+                return self.at(values, with_derivatives)
+        return self._results(values, known)
+
+    def critical_state(self, values: FloatArray) -> ParametricState | None:
+        """The bifurcation and its derivatives, of the values whose states were found last, or None.
+
+        What breaks the symmetry counts to the first order: not a tilt, but the holes' mean.
+        """
+        if (point := self._critical) is None:
+            return None
+        first, _, travel, _ = self._given(values)
+        self._vary(first)
+        factor = self.structure.factor(_BELOW * point.u)  # at it the tangent is singular
+        tangent = path_tangent(self.structure, factor, self.structure.load(point.u))
+        state = State(point.strain, point.u, tangent, 0)
+        by = self._by(state, -1, travel, None, factor, point.modes[0])
+        found = self._result(state, "critical", by, travel)
+        late = np.array([not self._parameters[name].is_symmetric for name in self.names])
+        return replace(found, strain=found.strain + float(found.strain_by @ (late * values)))
+
+    def _results(self, values: FloatArray, known: list[_Known]) -> list[ParametricState]:
+        """The states found last, and the critical one where it is wanted."""
         self._last = np.array(values), known
-        return [self._result(*one) for one in known]
+        _, late, travel, _ = found = self._given(values)
+        self._vary(found[0], 1.0, late)
+        states = [self._result(*one, travel) for one in known]
+        critical = self.critical_state(values) if self.with_critical else None
+        return [*states, critical] if critical else states
 
     def _given(
         self, values: FloatArray
@@ -216,6 +256,7 @@ class ParametricTest:
         k, law = len(values), with_omitted_terms(self.experiment.material)
         wider = replace(self.experiment, material=law)
         test = ParametricTest.meshed(wider, [*self.names, *OMITTED], self._degree)
+        test.with_critical = self.with_critical
         return [
             replace(s, displacement_by=s.displacement_by[k:], nodes_by=s.nodes_by[k:],
                     force_by=s.force_by[k:], strain_by=s.strain_by[k:])
@@ -226,11 +267,9 @@ class ParametricTest:
         """How the structure changes with a parameter."""
         found, spec, nodes = self._parameters[name], self.experiment.specimen, self._nodes
         zero = np.zeros_like(nodes)
-        return Variation(
-            zero if found.holes is None else hole_motion(nodes, spec, found.holes),
-            zero if found.edge is None else found.edge.at(nodes, spec),
-            found.constant,
-        )
+        moved = zero if found.holes is None else hole_motion(nodes, spec, found.holes)
+        edges = zero if found.edge is None else found.edge.at(nodes, spec)
+        return Variation(moved, edges, found.constant)
 
     def _sum(self, values: Mapping[str, float], names: Iterable[str]) -> Variation:
         """What some of the parameters make of nodes and edges together."""
@@ -246,8 +285,6 @@ class ParametricTest:
         self.structure.place(self._nodes + first.nodes + share * late.nodes)
         self.structure.lead(first.edges + share * late.edges)
 
-    # -- the path -----------------------------------------------------------------------
-
     def _states(
         self, travel: float, amplitudes: dict[int, float | None]
     ) -> list[tuple[State, str]]:
@@ -255,9 +292,12 @@ class ParametricTest:
         by_strain = [e for k, e in enumerate(strains) if amplitudes[k] is None]
         name = self.experiment.branches[0]
         # A branch of a given amplitude may begin beyond the strains of these parameters.
-        beyond = _BEYOND if len(by_strain) < len(strains) else 1.0
-        path, critical = self._primary(beyond * max(strains), by_strain, name)
-        self.critical_strain = None if critical is None else critical.strain
+        most = _BEYOND if len(by_strain) < len(strains) or self.with_critical else _AHEAD
+        most *= max(strains)
+        path, critical = self._primary(most, by_strain, name)
+        self._critical = critical
+        if critical is None and self.with_critical:
+            raise InputError(f"critical_strain: expected buckling up to {most:.4g}, got none")
         buckled: list[State] = []
         if critical is not None:
             targets = [e for e in by_strain if e > critical.strain]
@@ -334,12 +374,9 @@ class ParametricTest:
         follower.linearisation = None
         while points[-1].amplitude != target:
             left = target - points[-1].amplitude
-            amplitude = (
-                target
-                if abs(left) <= 1.1 * step
-                else points[-1].amplitude + (np.copysign(step, left))
-            )
-            constraint = Constraint(weights, origin, float(amplitude))
+            amplitude = points[-1].amplitude + float(np.copysign(step, left))
+            amplitude = target if abs(left) <= 1.1 * step else amplitude
+            constraint = Constraint(weights, origin, amplitude)
             guess = value_at(points, amplitude)
             at = follower.equilibrium(load_at(points, amplitude), guess, constraint, False)
             if at is None:
@@ -384,17 +421,16 @@ class ParametricTest:
             state, reached = found, aim
         return state
 
-    # -- its states ---------------------------------------------------------------------
-
     def _by(
         self, state: State, number: int, travel: float, weights: PETSc.Vec | None,
-        factor: BodyFactor | None,
+        factor: BodyFactor | None, mode: Mode | None = None,
     ) -> list[Sensitivity]:  # fmt: skip
         """Derivatives by all unknowns: zero by amplitudes of other states."""
         structure, length = self.structure, self.experiment.specimen.length
         own = [n for n in self.names if not n.startswith("amplitude")]
         variations = [None if n == TRAVEL else self._variations[n] for n in own]
-        parts = sensitivities(structure, state, variations, length, weights, travel, factor)
+        how = length, weights, travel, factor, mode
+        parts = sensitivities(structure, state, variations, *how)
         known: dict[str, Any] = dict(zip(own, parts, strict=True))
         if weights is not None:
             derivative = amplitude_sensitivity(structure, state, length, weights)
@@ -402,16 +438,22 @@ class ParametricTest:
         nothing = Sensitivity(structure.zero(), 0.0, 0.0)
         return [known.get(name, nothing) for name in self.names]
 
-    def _result(self, state: State, branch: str, by: Sequence[Sensitivity]) -> ParametricState:
+    def _result(
+        self, state: State, branch: str, by: Sequence[Sensitivity], travel: float
+    ) -> ParametricState:
         structure, length, mesh = self.structure, self.experiment.specimen.length, self.mesh
         if np.any(structure.nodes != self._nodes):
             mesh = replace(mesh, nodes=structure.on_shown(structure.nodes))
         names, shape = self.names[: len(by)], (-1, *mesh.nodes.shape)
-        fields = [structure.nodal(s.displacement) for s in by]
-        moved = [structure.on_shown(self._variations[n].nodes) for n in names]
+        fields, moved = (
+            [structure.nodal(s.displacement) for s in by],
+            [self._moved[n] for n in names],
+        )
+        of_travel = np.array([name == TRAVEL for name in names], np.float64)
+        strain, strain_by = state.strain / travel, np.array([s.strain for s in by])
         return ParametricState(
-            state.strain, mesh, structure.nodal(state.u), structure.reaction(state.u, length),
+            strain, mesh, structure.nodal(state.u), structure.reaction(state.u, length),
             state.negative_pivots, branch, np.reshape(fields, shape), np.reshape(moved, shape),
-            np.array([s.force for s in by]), np.array([s.strain for s in by]),
+            np.array([s.force for s in by]), np.asarray((strain_by - strain * of_travel) / travel),
             float(self._weights.dot(state.u)),
         )  # fmt: skip

@@ -1,17 +1,17 @@
 """Sensitivities of an equilibrium to a test's parameters: of material, loaded edges and holes.
 
 At an equilibrium R(u, p) = 0, so du/dp = -K^-1 dR/dp: with the factor that is there anyway, one
-back-substitution a parameter, all at once. dR/dp is taken by central differences in p, exact to
+back-substitution a parameter, all at once. dR/dp is taken by differences in p, exact to
 rounding in moduli, on which R depends linearly; where holes move, on a mesh whose nodes have moved.
 Near a bifurcation K is nearly singular; where the amplitude of the pattern is prescribed instead,
 the nominal strain follows from it, and both answer regularly to p: the bordered system, solved by
 block elimination (Keller, in: Applications of Bifurcation Theory, Academic Press 1977, pp.
-359-384).
+359-384). At it the strain follows from the mode's curvature; what drives the mode is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -23,10 +23,13 @@ from modeharvest.fem.materials import Material, functions_of
 from modeharvest.fem.path.continuation import State
 from modeharvest.fem.path.equilibrium import Structure
 from modeharvest.fem.path.factor import BodyFactor
+from modeharvest.fem.path.stability import Mode
 from modeharvest.util.arrays import FloatArray
 
 _STEP = 1e-4  # of a constant, for differences
 _STEP_MM = 3e-5  # of the largest motion of a node
+_AHEAD = 1e-3  # of these, where differences are of one side: errors below 1e-6 still
+_ALONG = 1e-5  # of strain, along a path
 OMITTED = ("omitted[0]", "omitted[1]", "omitted[2]")
 
 
@@ -55,14 +58,10 @@ class Sensitivity:
 
 
 def sensitivities(
-    structure: Structure,
-    state: State,
-    variations: Sequence[Variation | None],
-    length: float,
-    weights: PETSc.Vec | None = None,
-    travel: float = 1.0,
-    factor: BodyFactor | None = None,
-) -> list[Sensitivity]:
+    structure: Structure, state: State, variations: Sequence[Variation | None], length: float,
+    weights: PETSc.Vec | None = None, travel: float = 1.0, factor: BodyFactor | None = None,
+    mode: Mode | None = None,
+) -> list[Sensitivity]:  # fmt: skip
     """Derivatives of an equilibrium by parameters; one factorisation, one block of solutions.
 
     structure, state : parametric; its equilibrium, whose constants, edges and nodes it has.
@@ -71,26 +70,42 @@ def sensitivities(
     weights : of the amplitude that is prescribed, weights . u; by default the strain is.
     travel : the factor that the state's strain has in it.
     factor : of the tangent stiffness at the state, if it is at hand.
+    mode : the critical one of a bifurcation: the strain keeps its curvature zero; see above.
     """
     factor, tangent = factor or structure.factor(state.u), state.tangent
     along = structure.forces_along(state.u, structure.shortening)  # and K is symmetric
-    changes = [_change_of_forces(structure, state, v) for v in variations if v is not None]
-    solutions = zip(changes, _solutions(structure, factor, [f for f, _ in changes]), strict=True)
-    found = []
+    here = structure.forces(state.u)
+    changes = [_change_of_forces(structure, state, v, here) for v in variations if v is not None]
+    forces = [f for f, _ in changes]
+    solutions = zip(changes, _solutions(structure, factor, forces, mode), strict=True)
+    found = list[Sensitivity]()
+    softening = 1.0 if mode is None else _curvature_rate(structure, state, mode, tangent, None)
     for variation in variations:
         if variation is None:  # of no account where the amplitude says what the strain is
-            strain = 0.0 if weights is not None else state.strain / travel
+            strain = state.strain / travel if weights is None and mode is None else 0.0
             du, force = strain * tangent, strain * float(along.dot(tangent)) / length
         else:
             (forces, prescribed), du = next(solutions)
             strain = 0.0
             if weights is not None:
                 strain = -float(weights.dot(du)) / float(weights.dot(tangent))
-                du.axpy(strain, tangent)
+            if mode is not None:
+                rate = du + prescribed
+                strain = -_curvature_rate(structure, state, mode, rate, variation) / softening
+            du.axpy(strain, tangent)
             force = structure.reaction_of(forces, length) + float(along.dot(du)) / length
             du.axpy(1.0, prescribed)
         found.append(Sensitivity(du, force, strain))
     return found
+
+
+def _curvature_rate(
+    structure: Structure, state: State, mode: Mode, rate: PETSc.Vec, variation: Variation | None
+) -> float:
+    """d(mode . K mode) by a parameter, or by the strain, with which u changes at a rate [N]."""
+    step = _ALONG if variation is None else _step(structure, state, variation)
+    return float(_difference(structure, variation, step, lambda by: structure.curvature(
+        state.u + by * rate, mode.vector)))  # fmt: skip
 
 
 def amplitude_sensitivity(
@@ -99,50 +114,65 @@ def amplitude_sensitivity(
     """Derivatives of an equilibrium by the amplitude ``weights . u`` that is prescribed [1/mm]."""
     strain = 1.0 / float(weights.dot(state.tangent))
     du = strain * state.tangent
-    force = structure.reaction_of(structure.forces_along(state.u, du), length)
-    return Sensitivity(du, force, strain)
+    forces = structure.forces_along(state.u, du)
+    return Sensitivity(du, structure.reaction_of(forces, length), strain)
 
 
 def _solutions(
-    structure: Structure, factor: BodyFactor, forces: Sequence[PETSc.Vec]
+    structure: Structure, factor: BodyFactor, forces: Sequence[PETSc.Vec], mode: Mode | None
 ) -> list[PETSc.Vec]:
-    """-K^-1 times each of some forces [mm], zero at the constrained components."""
+    """-K^-1 times each of some forces [mm], zero at the constrained components; without a mode."""
     if not forces:
         return []
     rows = np.array([structure.free(vector.copy()).array for vector in forces])
+    if mode is not None:
+        rows -= np.outer(rows @ mode.vector.array, mode.weighted.array)
     size, comm = (forces[0].sizes, (None, len(forces))), forces[0].comm
     matrix = PETSc.Mat().createDense(size, array=np.asfortranarray(rows.T), comm=comm)
     found = factor.solve_block(matrix)  # named, because its array doesn't keep it alive
     solutions = [vector.duplicate() for vector in forces]
     for vector, column in zip(solutions, found.getDenseArray().T, strict=True):
         vector.array[:] = -column
+        if mode is not None:
+            vector.axpy(-mode.overlap(vector), mode.vector)
     return solutions
 
 
 def _change_of_forces(
-    structure: Structure, state: State, variation: Variation
+    structure: Structure, state: State, variation: Variation, here: PETSc.Vec
 ) -> tuple[PETSc.Vec, PETSc.Vec]:
     """d(internal forces)/d(parameter) at fixed free components, with d(constrained components)."""
-    constant, nodes = structure.constants.get(variation.constant), structure.nodes
     prescribed = state.strain * structure.constrained(variation.edges)
-    if constant is None:
-        largest = max(np.abs(variation.nodes).max(), np.abs(prescribed.array).max())
-        step = _STEP_MM / float(largest)
-    else:
-        value = float(constant.value)
-        step = _STEP * (abs(value) or 1.0)
-    total = structure.zero()
-    for by in (step, -step):
-        if constant is None:
-            structure.place(nodes + by * variation.nodes)
-        else:
+    step, base = _step(structure, state, variation), None if variation.nodes.any() else here
+    return _difference(structure, variation, step, lambda by: structure.forces(
+        state.u + by * prescribed), base), prescribed  # fmt: skip
+
+
+def _step(structure: Structure, state: State, variation: Variation) -> float:
+    """Of a parameter, for differences."""
+    if constant := structure.constants.get(variation.constant):
+        return _STEP * (abs(float(constant.value)) or 1.0)
+    moved = variation.nodes, state.strain * variation.edges
+    return _STEP_MM / float(np.abs(moved).max())
+
+
+def _difference(
+    structure: Structure, variation: Variation | None, step: float,
+    function: Callable[[float], Any], here: Any = None,
+) -> Any:  # fmt: skip
+    """Difference by a parameter of a function of its change: central, or from ``here`` without."""
+    constant = None if variation is None else structure.constants.get(variation.constant)
+    nodes, found = structure.nodes, []
+    value = 0.0 if constant is None else float(constant.value)
+    for by in (step, -step, 0.0) if here is None else (_AHEAD * step, 0.0):
+        if constant is not None:
             constant.value = value + by
-        total.axpy(0.5 / by, structure.forces(state.u + by * prescribed))
-    if constant is None:
-        structure.place(nodes)
-    else:
-        constant.value = value
-    return total, prescribed
+        elif variation is not None:
+            structure.place(nodes + by * variation.nodes)
+        if by:
+            found.append(function(by))
+    end, base = (0.5, found[-1]) if here is None else (1.0 / _AHEAD, here)
+    return (end / step) * (found[0] - base)
 
 
 def with_omitted_terms(material: Material) -> Material:

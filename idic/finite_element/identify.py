@@ -8,7 +8,7 @@ Hild & Roux, Arch. Comput. Methods Eng. 25 (2018) 533-573, doi 10.1007/s11831-01
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -44,8 +44,8 @@ _FORCE_PX = 0.01
 _HOLD = 0.3
 """Standard deviation, in scales, of unknowns about where a coarse level begins: blurred images know
 some of them hardly, and far off the model is another one."""
-_ROUNDS = 4  # of steps with a finer mesh's residual, at most
-_SETTLED = 0.1  # standard errors, rms: of the last of them
+_ROUNDS = 4  # of steps with a residual of another mesh or other slopes, at most
+_SETTLED = 0.05  # standard errors, rms: of the last of them
 _UNLIKE = 1.5  # times what noise alone makes: a residual that says so
 
 
@@ -89,10 +89,18 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """A reading of one number of each state: forces [N/mm] or nominal strains [-]."""
+    """A reading of one number of each state, or NaN: forces [N/mm] or nominal strains [-]."""
 
     values: FloatArray
-    sd: float
+    sd: FloatArray | float
+
+    def residuals(self, states: Sequence[ModelState], name: str) -> Iterator[tuple[float, Any]]:
+        """Residual over its standard deviation, and minus its derivatives, of each reading."""
+        sds = np.broadcast_to(self.sd, self.values.shape)
+        for value, state, sd in zip(self.values, states, sds, strict=False):
+            if np.isfinite(value):
+                by = getattr(state, f"{name}_by") / sd
+                yield float((value - getattr(state, name)) / sd), by
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +179,11 @@ class Identified:
         return any(part.residual > _UNLIKE * part.expected for part in self.state_equations)
 
     @property
+    def is_rejected(self) -> bool:
+        """Whether a test says that the model or its law is wrong."""
+        return any(test and test.is_rejected for test in (self.model_error, self.law_error))
+
+    @property
     def statements(self) -> tuple[str, ...]:
         """What the data don't determine, and which unknowns are at their bounds, in words."""
         scales, found = list[float](), in_words(self.model_error, self.law_error)
@@ -228,15 +241,9 @@ class _Cost:
         """Residuals of forces, strains and priors over their standard deviations, with -dr/dp."""
         found = list[tuple[float, Any]]()
         if self.forces is not None:
-            for measured, state in zip(self.forces.values, states, strict=True):
-                if np.isfinite(measured):
-                    r = float(measured - state.force) / self.forces.sd
-                    found.append((r, state.force_by / self.forces.sd))
+            found += self.forces.residuals(states, "force")
         if self.strains is not None:
-            for k, state in enumerate(states):
-                if f"amplitude[{k}]" in self.unknowns:
-                    r = float(self.strains.values[k] - state.strain) / self.strains.sd
-                    found.append((r, state.strain_by / self.strains.sd))
+            found += self.strains.residuals(states, "strain")
         for k, unknown in enumerate(self.unknowns.values()):
             if self.hold is not None:
                 sd = _HOLD * unknown.scale(unknown.start)
@@ -281,8 +288,8 @@ class _Cost:
         ]
         moved = float(np.sqrt(2.0 * np.mean(squares)))
         if self.forces is not None:
-            sizes = [abs(float(s.force_by @ change)) / self.forces.sd for s in states]
-            moved = max(moved, _FORCE_PX * max(sizes))
+            sizes = np.abs([s.force_by @ change for s in states]) / self.forces.sd
+            moved = max(moved, _FORCE_PX * float(sizes.max()))
         return moved
 
 
@@ -300,20 +307,20 @@ def identify(
     omitted: Model | None = None,
     progress: Progress = silent,
 ) -> Identified:
-    """Find the unknowns for which a model's states look like the data.
+    """Find the unknowns for which a model's states look like the data; InputError without states.
 
     model : gives as many states as there are data, with derivatives by the unknowns in their order.
     data : images or displacements of each state, or None where there is only a force.
     pixel_size : lengths of steps are counted in it [mm].
-    forces : readings [N/mm], NaN where there is none.
-    strains : readings of nominal strains; they count for states that are found by an amplitude.
+    forces : readings [N/mm], NaN where there is none; of the first states.
+    strains : readings of nominal strains, NaN where there is none; they count for states that are
+        found by something else, an amplitude or as critical ones.
     finer : a finer mesh, whose residual the last steps take, with this one's sensitivities; from
         both the values are extrapolated to no error (Richardson).
     corrections : (j, n, 2) of each state's nodal displacements that no law bounds [-], by which the
         model is tested.
     omitted : the states with derivatives by further parameters alone, which are 0 in the model:
         factors of terms that its law may lack, by which the law is tested.
-    InputError if the model has no states at the start.
     """
     if not any(data) and forces is None:
         raise InputError("expected images, displacements or forces to identify from, got none")
@@ -333,9 +340,13 @@ def identify(
         values = found.unknowns
     assert found is not None
     progress(len(stages), len(stages), "identify")
-    states, begin, factor = cost.states(values), values, 0.0
+    for part in data:
+        if part is not None:
+            part.weigh_by_reference()
+    values, states = _finished(cost, values, cost.states)
+    begin, factor = values, 0.0
     if finer is not None:
-        values, states = _finished(cost, values, finer)
+        values, states = _finished(cost, values, finer.model)
         factor = finer.error_ratio / (1.0 - finer.error_ratio)
     off = (values - begin) * factor
     found = replace(found, unknowns=values)
@@ -343,16 +354,15 @@ def identify(
     return replace(result, values=values + off)
 
 
-def _finished(
-    cost: _Cost, values: FloatArray, finer: FinerMesh
-) -> tuple[FloatArray, list[ModelState]]:
-    """Values and states by Gauss-Newton steps with a finer mesh's residual: no sensitivities."""
+def _finished(cost: _Cost, values: FloatArray, model: Model) -> tuple[FloatArray, list[ModelState]]:
+    """Values and states by Gauss-Newton steps with another model's residual: no sensitivities."""
     bounds = np.array([u.bounds for u in cost.unknowns.values()])
     for _ in range(_ROUNDS):
         states = [
-            replace(state, displacement=displacement_at(fine, state.mesh.nodes), force=fine.force)
-            for state, fine in zip(cost.states(values), finer.model(values), strict=True)
-        ]
+            replace(state, displacement=displacement_at(fine, state.mesh.nodes), force=fine.force,
+                    strain=fine.strain)
+            for state, fine in zip(cost.states(values), model(values), strict=True)
+        ]  # fmt: skip
         here = cost.equations_at(states, values)
         eigen = ScaledEigen.of(here.matrix)
         step = -eigen.solve(here.gradient)
@@ -384,7 +394,8 @@ def _assessed(
         blocks[: len(share.blocks)] += share.blocks
     limit = [
         replace(s, displacement=s.displacement + factor * (s.displacement - c.displacement),
-                force=s.force + factor * (s.force - c.force))
+                force=s.force + factor * (s.force - c.force),
+                strain=s.strain + factor * (s.strain - c.strain))
         for s, c in zip(states, cost.states(values), strict=True)
     ]  # fmt: skip
     wider = states if omitted is None else [

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -119,15 +119,17 @@ def joint_score(
         part = observed.equations(replace(state, displacement_by=by))
         to = np.r_[:k, k + j * number : k + j * (number + 1)]
         of = np.r_[k * number : k * (number + 1), k * len(seen) : len(fields)]
-        parts.append((part, to, of))
-        score[to] -= part.blocks.sum(axis=0)[of] / part.gain
+        parts.append((part, observed, replace(state, displacement_by=fields), to, of))
+        score[to] -= part.blocks.sum(axis=0)[of]
         information[np.ix_(to, to)] += part.matrix[np.ix_(of, of)]
         errors.append(np.zeros(n))
         errors[-1][to] = part.matrix[of, -1]
     noise = information.copy()
-    for (one, to, of), (other, to_t, of_t) in permutations(parts, 2):
-        both = 0.5 * np.sqrt(one.shared * other.shared) * (one.matrix + other.matrix)
-        noise[np.ix_(to, to_t)] += both[np.ix_(of, of_t)]
+    for (one, observed, state, to, of), (other, _, state_t, to_t, of_t) in combinations(parts, 2):
+        if factor := one.shared * other.shared:
+            both = factor * observed.shared(state, state_t)[np.ix_(of, of_t)]
+            noise[np.ix_(to, to_t)] += both
+            noise[np.ix_(to_t, to)] += both.T
     for number, ((r, slopes), (r_expected, _)) in enumerate(zip(scalars, expected, strict=True)):
         row = np.append(slopes, np.zeros(n - len(slopes)))
         if number < readings:

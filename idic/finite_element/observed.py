@@ -8,7 +8,7 @@ material stays where the reference shows it. Pixels are sorted by elements anew 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -19,12 +19,13 @@ from modeharvest.idic.finite_element.fields import determinant, element_gradient
 from modeharvest.idic.finite_element.pixels import (
     MeshPixels,
     NodalEquations,
+    continued_spline,
     images_on,
     normal_equations,
 )
 from modeharvest.idic.finite_element.result import located, nodal_values
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
-from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, eroded
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
@@ -39,6 +40,8 @@ _EDGE_PX = 2
 """Left out at edges: with 1 px more is known, but what g is continued by shows."""
 _LEAST_DET = 0.1
 _MOST_NOISE = 0.9  # of the mean square slope
+_TINY = float(np.finfo(np.float64).tiny)
+_CHUNK = 1024  # elements
 _ALONG = 8
 """Parts of the body along its length whose residuals are taken for independent."""
 
@@ -56,11 +59,9 @@ class StateEquations:
     """Rms of what is compared: grey levels, or mm per component."""
     expected: float
     """The same by noise alone."""
-    gain: float = 1.0
-    """Ratio of the slopes' signal to all of the slopes, noise included: the gradient over this has
-    the covariance ``matrix``."""
     shared: float = 0.0
-    """Correlation with the noise of another state's share, by a reference that both have."""
+    """Of the noise of a reference that states share: their gradients have the covariance of two
+    such factors times the product that :meth:`ImageData.shared` gives."""
 
 
 Light = Callable[[ImagePair, Mesh, FloatArray], ImagePair]
@@ -73,8 +74,14 @@ class StateObservation(Protocol):
     def prepare(self, level: Level, state: ModelState) -> None:
         """Have the data of a level, weighted as the model's state asks for."""
 
+    def weigh_by_reference(self) -> None:
+        """Let slopes weigh the residual whose noise has nothing to do with its own."""
+
     def equations(self, state: ModelState) -> StateEquations:
         """The share of the normal equations at the model's state."""
+
+    def shared(self, state: ModelState, other: ModelState) -> FloatArray:
+        """(k, k) products of slopes of this state and of another one in the same reference."""
 
 
 class ImageData:
@@ -122,6 +129,8 @@ class ImageData:
         images = self._images
         self._own = self.pixels.on(images.grid, images.mask, images.reference)
         self._weight, self._gain, self._shared = 1.0, 1.0, 0.0
+        if level == FULL:
+            self._by_noise(pair, state, light)
         nodal = self._nodal(state)
         if nodal.pixels == 0:
             raise InputError("expected pixels of the model's mesh in both images, got none")
@@ -129,20 +138,39 @@ class ImageData:
             # Blurred pixels are alike: as many count as there are independent ones.
             self._expected = nodal.rms
             self._weight = 1.0 / (nodal.rms**2 * max(1.0, 4.0 * np.pi * level.blur**2))
-            return
-        u, px = state.displacement, self.pair.grid.pixel_size
-        gradients = element_gradients(mesh, u)
-        det = np.maximum(determinant(np.eye(2) + gradients.mean(axis=1)), _LEAST_DET)
-        transfer = NoiseTransfer.at(u[mesh.cells].mean(axis=1) / px, det, self.order)
+
+    def _by_noise(self, pair: ImagePair, state: ModelState, light: float) -> None:
+        """Slopes of the reference, and weights by the noise of both images."""
+        px, u, own = pair.grid.pixel_size, displacement_at(state, self.pixels.mesh.nodes), self._own
+        spline = continued_spline(pair.reference, pair.masks[0], self.order)
+        _, d_row, d_col = spline.sample(own.row, own.col)
+        self._slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
+        F = self._deformation(state)
+        det = np.maximum(determinant(F), _LEAST_DET)
+        transfer = NoiseTransfer.at(u[self.pixels.mesh.cells].mean(axis=1) / px, det, self.order)
         f, g = self.noise.reference**2, (light * self.noise.deformed) ** 2
-        slopes = float(nodal.blocks[:, [0, 2]].sum()) / nodal.pixels  # mean of |grad g|^2
-        share = min(2.0 * g * transfer.slope / px**2 / slopes, _MOST_NOISE)
+        slopes = float(np.mean(d_row**2 + d_col**2))
+        share = min(2.0 * f * slope_noise(self.order, 0.0) / max(slopes, _TINY), _MOST_NOISE)
         self._expected = float(np.sqrt(f + g * transfer.value))
-        # Slopes of g's noise times g's noise scatter, too: without that term chi squared of a
-        # right model was 8 % too large at 1 % noise.
-        noise = f + g * (transfer.density * (1.0 - share) + transfer.value * share)
+        # The slopes' noise meets g's alone: times its own f's makes nothing of smooth fields.
         self._gain = 1.0 - share
-        self._weight, self._shared = self._gain**2 / noise, self._gain * f / noise
+        noise = self._gain * f + g * (transfer.density * self._gain + transfer.value * share)
+        self._weight = self._gain / noise
+        self._shared = self._gain * np.sqrt(self._gain * f) / noise
+
+    def weigh_by_reference(self) -> None:
+        """Let the reference's slopes, pushed forward, weigh the residual in place of g's.
+
+        Between pixels the noise of g varies less, and its slope says where: the mean of their
+        product is not 0 but half the slope of the variance, which biases what fits best.
+        """
+        self._own = self._own._replace(slope=self._slope)
+
+    def _deformation(self, state: ModelState) -> FloatArray:
+        """(m, 2, 2) mean deformation gradient of the elements of the pixels' mesh."""
+        mesh = self.pixels.mesh
+        u = displacement_at(state, mesh.nodes)
+        return np.asarray(np.eye(2) + element_gradients(mesh, u).mean(axis=1))
 
     def _nodal(self, state: ModelState) -> NodalEquations:
         mesh = self.pixels.mesh
@@ -150,21 +178,23 @@ class ImageData:
 
     def equations(self, state: ModelState) -> StateEquations:
         """Projected from those of the nodes' displacements."""
-        nodal, cells = self._nodal(state), self.pixels.mesh.cells
-        S = state.displacement_by[:, cells]  # (k, m, 6, 2)
-        parts = -np.einsum("kmai,mai->mk", S, nodal.gradient)
-        blocks = np.zeros((self.block.max() + 1, len(S)))
-        np.add.at(blocks, self.block, parts)
-        xx, xy, yy = np.moveaxis(nodal.blocks, 1, 0)
-        x, y = S[..., 0], S[..., 1]
-        left = np.einsum("mab,kmb->kma", xx, x) + np.einsum("mab,kmb->kma", xy, y)
-        right = np.einsum("mba,kmb->kma", xy, x) + np.einsum("mab,kmb->kma", yy, y)
-        matrix = np.tensordot(x, left, ([1, 2],) * 2) + np.tensordot(y, right, ([1, 2],) * 2)
-        w = self._weight
+        nodal, cells, by = self._nodal(state), self.pixels.mesh.cells, state.displacement_by
+        blocks = np.zeros((self.block.max() + 1, len(by)))
+        for some, S in _chunks(by, cells):
+            np.add.at(
+                blocks, self.block[some], -(nodal.gradient[some].reshape(-1, 1, 12) @ S)[:, 0]
+            )
+        matrix, w = self._gain * _products(by, cells, _square(nodal)), self._weight
         return StateEquations(
             w * blocks, w * 0.5 * (matrix + matrix.T), w * nodal.square_sum, nodal.pixels,
-            nodal.rms, self._expected, self._gain, self._shared,
+            nodal.rms, self._expected, self._shared,
         )  # fmt: skip
+
+    def shared(self, state: ModelState, other: ModelState) -> FloatArray:
+        """(k, k) sums of the slopes along a state's fields times those along them in another."""
+        pulled = self._deformation(state) @ np.linalg.inv(self._deformation(other))  # slopes: F^-T
+        squares = np.einsum("mijab,mjl->milab", _square(self._nodal(state)), pulled)
+        return _products(state.displacement_by, self.pixels.mesh.cells, squares)
 
     def residual(self, state: ModelState) -> FloatArray:
         """(rows, cols) f - g(x + u) [grey levels] of the pixels compared; NaN elsewhere."""
@@ -206,6 +236,13 @@ class FieldData:
 
     def prepare(self, level: Level, state: ModelState) -> None:
         """Nothing: displacements have no levels."""
+
+    def weigh_by_reference(self) -> None:
+        """Nothing: displacements have no slopes."""
+
+    def shared(self, state: ModelState, other: ModelState) -> FloatArray:
+        """Nothing: displacements have no reference."""
+        return np.zeros((len(state.displacement_by),) * 2)
 
     def equations(self, state: ModelState) -> StateEquations:
         """By differences of displacements at the points."""
@@ -287,6 +324,28 @@ def at_fixed_points(state: ModelState) -> ModelState:
     slopes = mean_around(state.mesh, element_gradients(state.mesh, state.displacement))
     by = state.displacement_by - np.einsum("nij,knj->kni", slopes, state.nodes_by)
     return replace(state, displacement_by=by, nodes_by=state.nodes_by[:0])
+
+
+def _square(nodal: NodalEquations) -> FloatArray:
+    """(m, 2, 2, 6, 6) products of slopes along x and y."""
+    xx, xy, yy = np.moveaxis(nodal.blocks, 1, 0)
+    return np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0)
+
+
+def _chunks(by: FloatArray, cells: IntArray) -> Iterator[tuple[slice, FloatArray]]:
+    """Some elements at a time, with fields (k, n, 2) at their nodes (m, 12, k): all are large."""
+    for first in range(0, len(cells), _CHUNK):
+        some = slice(first, first + _CHUNK)
+        yield some, np.moveaxis(by[:, cells[some]], 0, -1).reshape(-1, 12, len(by))
+
+
+def _products(by: FloatArray, cells: IntArray, blocks: FloatArray) -> FloatArray:
+    """(k, k) sums over elements of fields (k, n, 2) before and behind blocks."""
+    matrix = np.zeros((len(by), len(by)))
+    for some, S in _chunks(by, cells):
+        B = np.einsum("mijab->maibj", blocks[some]).reshape(-1, 12, 12)
+        matrix += S.reshape(-1, len(by)).T @ (B @ S).reshape(-1, len(by))
+    return matrix
 
 
 def _blocks(mesh: Mesh) -> IntArray:

@@ -16,7 +16,7 @@ _POINTS = 4000  # at which displacements are compared
 _LISTED = 3  # combinations, and terms of each
 FINE = 5.0
 """Where w is 2 px rms, IDIC is 0.25 px from the best fit with speckles of 12 px, 0.47 px with 0.7
-times that, at a local minimum with half of it (docs/studies.md, size of the speckle)."""
+times that, at a local minimum with half of it (docs/how-to/studies.md, size of the speckle)."""
 OBSERVABLE = 2.0
 """A mode counts as observable if v_i phi_i is that many times the model error."""
 

@@ -52,10 +52,13 @@ _GRADES = ((10.0, "decisive"), (6.0, "strong"), (2.0, "positive"))
 Stat. Assoc. 90 (1995) 773-795, doi 10.1080/01621459.1995.10476572 ("very strong" there)."""
 
 
-def compared_by_evidence(names: Sequence[str], evidence: Sequence[tuple[float, float]]) -> str:
+def compared_by_evidence(
+    names: Sequence[str], evidence: Sequence[tuple[float, float]], rejected: Sequence[str]
+) -> str:
     """Which of several models the data prefer, in words.
 
     evidence : logarithm of each, and what of it is by the mesh: the Bayes factor is as uncertain.
+    rejected : those that a test of their own rejects.
     """
     values, by_mesh = np.array(evidence).T
     best, second = (int(k) for k in np.argsort(-values)[:2])
@@ -63,6 +66,9 @@ def compared_by_evidence(names: Sequence[str], evidence: Sequence[tuple[float, f
     least = difference - abs(by_mesh[best] - by_mesh[second])
     grade = next((word for limit, word in _GRADES if 2.0 * least > limit), None)
     factor = f"the logarithm of the Bayes factor is {difference:.3g}, {least:.3g} at least"
+    doubt = ""
+    if names[best] in rejected:
+        doubt = f"; but the tests reject {names[best]} itself: it is the least wrong of these"
     if grade is None:
-        return f"{names[best]} and {names[second]} are not distinguishable ({factor})"
-    return f"evidence for {names[best]} against {names[second]} is {grade} ({factor})"
+        return f"{names[best]} and {names[second]} are not distinguishable ({factor}){doubt}"
+    return f"evidence for {names[best]} against {names[second]} is {grade} ({factor}){doubt}"

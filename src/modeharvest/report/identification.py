@@ -181,7 +181,7 @@ def _residual_cards(
     if found is None or mesh is None:
         return []
     figures = []
-    for k, (state, part) in enumerate(zip(found.states, data, strict=True), start=1):
+    for k, (state, part) in enumerate(zip(found.states, data, strict=False), start=1):
         if isinstance(part, ImageData):
             frame = MapFrame.of(MeshBoundary.of(mesh), part.pair.grid)
             field = frame.average(part.residual(state))

@@ -78,7 +78,7 @@ class DesignRun(StagedRun[DesignCase]):
         return summary
 
     def summary(self, design: Design) -> dict[str, Any]:
-        """The content of ``summary.json``: docs/design.md."""
+        """The content of ``summary.json``: docs/how-to/design.md."""
         setup, options, state = design.setup, design.options, design.state(design.setup)
         expected = design.expected(setup)
         varied = {x: [{"value": v, **asdict(e)} for v, e in design.varied(x)] for x in AXES}

@@ -63,8 +63,13 @@ class MeasuredData:
     shift and a turn of each state are found, too, of up to some 10 px."""
     strain_sd: float = 1e-5
     """Standard deviation of nominal strains, for states found by an amplitude [-]."""
+    critical_strain: tuple[float, float] | None = None
+    """Nominal strains of the last frame of a film without the pattern and of the first with it."""
 
     def __post_init__(self) -> None:
+        if self.critical_strain and not 0.0 < self.critical_strain[0] < self.critical_strain[1]:
+            got = [*self.critical_strain]
+            raise InputError(f"data: expected critical_strain = [low, high] above 0, got {got}")
         if bool(self.fields) == bool(self.reference or self.deformed):
             raise InputError(
                 "data: expected images (reference and deformed) or fields, got "
@@ -117,8 +122,11 @@ class TwinTruth:
     force_sd: float = 0.0
     """Of the load cell; 0 for a test without forces [N/mm]."""
     force_seed: int = 0
+    frame_strain: float = 0.0
+    """From frame to frame of a film that brackets the critical strain [-]; 0 for none."""
 
     def __post_init__(self) -> None:
+        require_within("twin: expected frame_strain", self.frame_strain, 0.0)
         require_within("twin: expected mesh_size [mm]", self.mesh_size, 0.0, above=True)
         require_within("twin: expected force_sd [N/mm]", self.force_sd, 0.0)
 
@@ -134,10 +142,8 @@ class TwinTruth:
 
     def value(self, name: str) -> float | None:
         """Of a parameter by its name, holes aside; None if it has none of that name."""
-        if name in self.values:
-            return self.values[name]
-        if name in (TRAVEL, TILT):
-            return float(getattr(self, name))
+        if (known := {TRAVEL: self.travel, TILT: self.tilt, **self.values}).get(name) is not None:
+            return known[name]
         if name.startswith(("left.", "right.")):
             return 0.0
         base, _, number = name.rstrip("]").partition("[")

@@ -40,7 +40,7 @@ from modeharvest.idic.finite_element.observed import (
     rigidly_moved,
 )
 from modeharvest.idic.finite_element.pixels import MeshPixels
-from modeharvest.idic.local.field import read_field
+from modeharvest.idic.local.field import LocalField, read_field
 from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
@@ -54,7 +54,7 @@ from modeharvest.imaging.photographs.photograph import read_frame, read_referenc
 from modeharvest.runs.case import checked
 from modeharvest.runs.identification.case import IdentificationCase, MeasuredData, TwinTruth
 from modeharvest.runs.identification.placement import found_place
-from modeharvest.runs.photographs.prepare import named_files
+from modeharvest.runs.photographs.sequence import named_files
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, sha256_of, write_json
@@ -67,9 +67,8 @@ _FRAME = {"centre": (0.02, "mm"), "orientation": (0.02, "rad"),
 and their units."""
 _DEGREE, _FINE_DEGREE = 3, 4
 """Of the polynomials over an element: of the model, and of the finer mesh and of twins."""
-_ERROR_RATIO = 0.06
-"""Of the errors of these two: docs/identification.md, "Mesh"."""
 _OTHER = {"buckled+": "buckled-", "buckled-": "buckled+"}
+_NEAR = 100.0  # strain_sd from the critical strain: nearer to it amplitudes are tried
 _SAME_MM = 1e-5
 """By which states found step by step and along the whole path may differ."""
 _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "fenics-dolfinx")
@@ -95,8 +94,6 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             self.do("identify", self._key, self._identify)
         return dict(read_json(path))
 
-    # -- parts --------------------------------------------------------------------------
-
     @cached_property
     def _data_key(self) -> str:
         plain = self.case.plain()
@@ -110,16 +107,21 @@ class IdentificationRun(StagedRun[IdentificationCase]):
     @cached_property
     def _files(self) -> tuple[Path, ...]:
         """Those that the case names."""
-        data, base = self.case.data, self.case._base
-        if data is None:
+        if (data := self.case.data) is None:
             return ()
         names = data.fields or (data.reference, *data.deformed)
-        found = named_files(base, names, unique=False)
+        found = named_files(self.case._base, names, unique=False)
         strains = len(self.case.experiment.strains)
         if (got := len(found) - bool(data.reference)) != strains:
             what = "fields" if data.fields else "deformed images"
             raise InputError(f"data: expected as many {what} as strains ({strains}), got {got}")
         return found
+
+    @cached_property
+    def _given(self) -> list[LocalField]:
+        if not (data := self.case.data) or not data.fields:
+            return []
+        return [read_field(path, units="mm", y_axis=data.y_axis) for path in self._files]
 
     @property
     def _lens(self) -> tuple[Path, ...]:
@@ -138,7 +140,12 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         true = replace(self.case.experiment, material=twin.material, mesh_size=twin.mesh_size)
         values = twin.every(true)
         model = self._model(true, list(values), _FINE_DEGREE)
+        model.with_critical = twin.frame_strain > 0.0
         states = model.at(np.array(list(values.values())), False)
+        readings = dict[str, Any]()
+        if twin.frame_strain:
+            low = twin.frame_strain * np.floor(states.pop().strain / twin.frame_strain)
+            readings["critical_strain"] = [low, low + twin.frame_strain]
         strains, folder = self.case.experiment.strains, self.folder / "images"
         snapshots = tuple(
             Snapshot(e, s.displacement, s.force, negative_pivots=s.negative_pivots, branch=s.branch)
@@ -149,28 +156,30 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         forces = np.array([s.force for s in states])
         noise = np.random.default_rng(twin.force_seed).normal(0.0, 1.0, len(forces))
         path = self.folder / "forces.json"
-        write_json(path, {"forces_N_per_mm": list(forces + twin.force_sd * noise)})
+        readings["forces_N_per_mm"] = list(forces + twin.force_sd * noise)
+        write_json(path, readings)
         return [*images.files, path]
 
     def _identify(self) -> list[Path]:
         experiment = self.case.experiment
-        data, forces, px, frame = self._data(self._model(experiment, []).mesh)
-        found, model, choices = self._best(self.case, data, forces, px, frame)
-        laws, comparison = self._laws(found, data, forces, px, frame)
+        data, *given = self._data(self._model(experiment, []).mesh)
+        data += [None] * (len(self._strains.values) - len(data))  # the critical state
+        found, model, choices = self._best(self.case, data, *given)
+        laws, comparison = self._laws(found, data, *given)
         mesh = found.states[0].mesh
         solution = Solution(mesh, tuple(
             Snapshot(s.strain, s.displacement, s.force, negative_pivots=s.negative_pivots,
-                     branch=s.branch) for s in found.states
+                     branch=s.branch) for s in found.states[: len(experiment.strains)]
         ), {"specimen": experiment.specimen.plain()})  # fmt: skip
         names = ("solution.h5", "solution.vtu", "report.html", "summary.json")
         h5, vtu, page, path = (self.folder / name for name in names)
         solution.write(h5)
         solution.write_vtu(vtu)
+        model.with_critical = False  # there, displacement along the mode costs nothing
         warnings = _path_warnings(model, found.minimum.unknowns[: len(model.names)])
-        summary = self._summary(found, model) | {"warnings": warnings}
-        summary |= to_plain({"laws": laws, "statements": [
-            *found.statements, *choices, *comparison,
-        ]})  # fmt: skip
+        summary = self._summary(found, model)
+        statements = [*found.statements, *choices, *comparison, *(f.read_as for f in self._given)]
+        summary |= to_plain({"laws": laws, "statements": statements, "warnings": warnings})
         from modeharvest.report.identification import identification_report
         from modeharvest.report.model import write_page
 
@@ -185,7 +194,10 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         if not (found.is_unlike and any(s.branch in _OTHER for s in found.states)):
             return found, model, []
         experiment = replace(case.experiment, branches=(_OTHER[named],))
-        other = self._identified(case.model_copy(update={"experiment": experiment}), *data)
+        try:
+            other = self._identified(case.model_copy(update={"experiment": experiment}), *data)
+        except InputError:  # it doesn't reach the states
+            return found, model, []
         if other[0].minimum.equations.cost > found.minimum.equations.cost:
             return found, model, []
         return *other, [f"the specimen is on {_OTHER[named]}: on {named} the model fits worse"]
@@ -199,25 +211,43 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         model = self._model(experiment, list(unknowns))
         size = self.case.finer_mesh_size or 0.7 * experiment.mesh_size
         fine = self._model(replace(experiment, mesh_size=size), list(unknowns), _FINE_DEGREE)
+        model.with_critical = fine.with_critical = len(data) > len(experiment.strains)
         has_place = any(name in PLACE for name in frame)
 
         def seen(model: Any, values: FloatArray, with_derivatives: bool) -> list[Any]:
             own, place, motions = np.split(values, [len(unknowns), len(unknowns) + 3 * has_place])
             states = model.near(own, with_derivatives)
-            motions = motions.reshape(-1, 3)
-            return [imaged(state, place if has_place else None, motions, k)
+            motions = motions.reshape(-1, 3)  # the critical state has no image
+            return [imaged(state, place if has_place else None, motions, min(k, len(motions) - 1))
                     for k, state in enumerate(states)]  # fmt: skip
 
-        strain_sd = 1e-5 if self.case.data is None else self.case.data.strain_sd
-        return identify(
+        found = identify(
             lambda values: seen(model, values, True), data, unknowns | frame, pixel_size=px,
             forces=forces, levels=(*[Level(4, 3.0)] * (f"{MOTION[0]}[0]" in frame), *LEVELS),
-            strains=Readings(np.array(experiment.strains), strain_sd),
-            finer=FinerMesh(lambda values: seen(fine, values, False), _ERROR_RATIO),
+            strains=self._strains,
+            finer=FinerMesh(
+                lambda values: seen(fine, values, False), error_ratio(size / experiment.mesh_size)
+            ),
             corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
             omitted=lambda values: model.omitted_terms(values[: len(unknowns)]),
             progress=self.progress,
-        ), model  # fmt: skip
+        )  # fmt: skip
+        if not (near := self._beside_critical(found, fine)):
+            return found, model
+        wider = case.model_copy(update={"unknowns": unknowns | near})
+        other = self._identified(wider, data, forces, px, frame)
+        return min((found, model), other, key=lambda pair: pair[0].minimum.equations.cost)
+
+    def _beside_critical(self, found: Identified, fine: Any) -> dict[str, Unknown]:
+        """Amplitudes of states so near the critical point that their strain hardly says them."""
+        critical, experiment = fine.critical_strain, fine.experiment
+        travel = dict(zip(found.unknowns, found.minimum.unknowns, strict=True)).get("travel", 1.0)
+        off = np.abs(travel * np.array(experiment.strains) - (critical or np.inf))
+        reach = 0.5 * experiment.specimen.pitch
+        start = 0.04 * reach * (-1.0 if experiment.branches[0] == "buckled-" else 1.0)
+        near = np.flatnonzero(off < _NEAR * np.ravel(self._strains.sd)[0])
+        names = {f"amplitude[{k}]" for k in near} - found.unknowns.keys()
+        return {name: Unknown(start, (-reach, reach)) for name in sorted(names)}
 
     def _laws(self, found: Identified, *data: Any) -> tuple[list[dict[str, Any]], list[str]]:
         """The evidence for each of the case's materials, and which is the best, in words."""
@@ -227,7 +257,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         if len(results) == 1:
             return [], []
         evidence = [result.log_evidence() for result in results.values()]
-        text = compared_by_evidence(list(results), evidence)
+        rejected = [name for name, result in results.items() if result.is_rejected]
+        text = compared_by_evidence(list(results), evidence, rejected)
         return [
             {"name": name, "log_evidence": log, "log_evidence_by_mesh": by_mesh,
              "model_error": result.model_error, "law_error": result.law_error,
@@ -253,11 +284,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         start = {f"{name}[{k}]": 0.0 for k in range(count) for name in MOTION}
         if data.fields:
             assert data.field_sd_mm is not None
-            fields = [read_field(path, units="mm", y_axis=data.y_axis) for path in self._files]
-            found: list[Any] = [
-                FieldData(f.points[f.good], f.u[f.good], data.field_sd_mm, mesh) for f in fields
-            ]
-            px = data.field_sd_mm
+            px, given = data.field_sd_mm, self._given
+            found: list[Any] = [FieldData(f.points[f.good], f.u[f.good], px, mesh) for f in given]
         else:
             pairs, place = self._photographed(data)
             if place is not None:
@@ -276,24 +304,33 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             frame[name] = Unknown(value, (value - reach, value + reach))
         return found, data.forces, px, frame
 
+    @property
+    def _strains(self) -> Readings:
+        """Of the states; and the critical one by a film: between two frames, all alike likely."""
+        e, data = np.array(self.case.experiment.strains), self.case.data
+        sds = np.full(len(e), 1e-5 if data is None else data.strain_sd)
+        path = self.folder / "forces.json"
+        frames = data.critical_strain if data else read_json(path).get("critical_strain")
+        if frames is None:
+            return Readings(e, sds)
+        return Readings(
+            np.append(e, np.mean(frames)), np.append(sds, np.ptp(frames) / np.sqrt(12.0))
+        )
+
     def _exposed(self, images: ImageSet, mesh: Mesh) -> Iterator[ImageData]:
         """The images of a twin, freed from what its lens is known to do."""
         lens = self.case.imaging.lens(images.grid.shape)
         light = partial(alike, degree=0) if self.case.imaging.sensor.flicker else None
         pixels = MeshPixels(mesh)
 
-        def image(strain: float | None) -> FloatImage:
-            own = (
-                images.reference(camera=True)
-                if strain is None
-                else images.deformed(strain, camera=True)
-            )
-            return own if lens is None else undistorted(own, lens)
+        def freed(image: FloatImage) -> FloatImage:
+            return image if lens is None else undistorted(image, lens)
 
+        reference = freed(images.reference(camera=True))
         for e in images.strains:
             at = ((None, images.mask()), (e, images.deformed_mask(e)))
             sds = [float(images.noise_sd(which)[where].mean()) for which, where in at]
-            pair = ImagePair(image(None), image(e), images.grid)
+            pair = ImagePair(reference, freed(images.deformed(e, camera=True)), images.grid)
             yield ImageData(pair, pixels, ImageNoise(*sds), light)
 
     def _photographed(self, data: MeasuredData) -> tuple[list[ImagePair], FloatArray | None]:
@@ -322,15 +359,14 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         own = np.nan_to_num(covariance, posinf=1e6)  # of what nothing determines
         variance = np.einsum("ij,jk,ik->i", design, own, design)
         sd = np.hypot(np.sqrt(variance), design @ found.mesh_error[chosen]).reshape(-1, 3)
-        exact = None
+        values = {} if twin is None else twin.every(experiment)
+        exact = holes_of(list(values), list(values.values()), experiment)
         if twin is not None:
-            values = twin.every(experiment)
-            exact = holes_of(list(values), list(values.values()), experiment)
             true |= dict(zip(names, np.linalg.lstsq(design, exact.ravel())[0], strict=True))
         spec = experiment.specimen
         return [
             {"centre": spec.hole_centres[k], "diameter": spec.diameters[k], "off": off[k],
-             "off_sd": sd[k], "true": None if exact is None else exact[k]}
+             "off_sd": sd[k], "true": None if twin is None else exact[k]}
             for k in range(len(off))
         ], true  # fmt: skip
 
@@ -338,6 +374,18 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         """Of an unknown."""
         frame = _FRAME.get(re.split(r"[_[]", name)[0])
         return parameter(name, self.case.experiment).unit if frame is None else frame[1]
+
+    def _critical(self, found: Identified, model: Any) -> dict[str, Any] | None:
+        """The critical strain of the model whose states were found last, and what was measured."""
+        last, reading = found.states[-1], self._strains
+        is_datum, own = last.branch == "critical", found.minimum.unknowns[: len(model.names)]
+        if (state := last if is_datum else model.critical_state(own)) is None:
+            return None
+        by, n = state.strain_by, len(state.strain_by)
+        covariance = np.nan_to_num(found.covariance_with_model_error[:n, :n], posinf=0.0)
+        measured, sd = (reading.values[-1], np.ravel(reading.sd)[-1]) if is_datum else (None, None)
+        return {"value": state.strain, "sd": np.sqrt(by @ covariance @ by),
+                "measured": measured, "measured_sd": sd}  # fmt: skip
 
     def _summary(self, found: Identified, model: Any) -> dict[str, Any]:
         case, forces, (holes, true) = self.case, found.forces, self._holes(found)
@@ -350,10 +398,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
              "true": true.get(name)}
             for name, unknown, value, sd, sd_model, off in rows
         ]  # fmt: skip
-        readings: FloatArray = (
-            np.full(len(found.states), np.nan) if forces is None else forces.values
-        )
-        of_states = zip(found.states, found.force_sd, readings, found.state_equations, strict=True)
+        readings = [np.nan] * len(found.states) if forces is None else forces.values
+        of_states = zip(found.states, found.force_sd, readings, found.state_equations, strict=False)
         states = [
             {"nominal_strain": s.strain, "branch": s.branch, "negative_pivots": s.negative_pivots,
              "force_N_per_mm": s.force, "force_sd_N_per_mm": sd, "force_measured_N_per_mm": F,
@@ -369,7 +415,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "law_error": found.law_error,
             "outcome": found.minimum.outcome.value,
             "explanation": found.minimum.outcome.explanation,
-            "critical_strain": model.critical_strain,
+            "critical_strain": self._critical(found, model),
             "states": states,
             "holes": holes,
             "force_sd_N_per_mm": None if forces is None else forces.sd,
@@ -378,6 +424,14 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "case": case.plain(),
             "versions": versions(*_LIBRARIES),
         }))  # fmt: skip
+
+
+def error_ratio(sizes: float) -> float:
+    """Ratio of the finer mesh's error to the model's, of the ratio of their elements' sizes.
+
+    As fits most parameters of a specimen, by benchmarks/identification_statistics.py --fields.
+    """
+    return float(0.06 * (sizes / 0.7) ** 5)
 
 
 def _path_warnings(model: Any, values: FloatArray) -> list[str]:
