@@ -7,7 +7,7 @@ with noise. The error at a pixel is the sum of
 - smoothing: what the regularisation takes away of that fit, A^-1 lambda R (u_0 - u), and what of
   that is put back;
 - images: what else exact images leave at the same cut-off wavelength: splines between pixels,
-  pixels continued beyond edges, steps that are not linear;
+  pixels continued beyond edges, what is known of free edges, steps that are not linear;
 - noise: what camera images leave more, by quantisation or noise.
 
 Printed are, for each cause and for all of them, the rms per component at edges, the longest vector

@@ -8,7 +8,11 @@ and what others would have left.
 
 Run: scripts/env python benchmarks/whole_field.py FOLDER [--strain 0.128] [--noise 0 0.01 0.02]
      [--seeds 1] [--mesh mask|specimen] [--law right …] [--element 24 12] [--others 0.7 1.4 2]
-     [--json FILE]
+     [--window 880 1400 560 840] [--no-free-edges] [--json FILE]
+
+A window, rows and columns from and to, is measured alone, as if nothing else were known of the
+body, in seconds; errors are counted 15 px inside. --no-free-edges measures without what free edges
+have in common.
 
 Laws are the truth's own and wrong ones; of the free edges' nodes the share that contradicts the law
 is said, and with * that the measurement warns of it.
@@ -37,10 +41,13 @@ from modeharvest.idic.correlate import best_fit, fit_displacement
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
+from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.pair import ImagePair, Truth
 
 EDGE_PX = 10
+MARGIN_PX, INSIDE_PX = 90, 15
+"""Around a window, and from its border to where errors are counted."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +93,9 @@ class Regions:
         """Of a specimen whose middle is the origin."""
         mask = pair.masks[0]
         edges = mask & (ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] <= EDGE_PX)
+        if pair.truth is not None:  # which is that of a part alone in a window
+            mask = mask & np.isfinite(pair.truth.displacement[..., 0])
+            edges &= mask
         a, b = specimen.cellular_half_size
         outside = (abs(pair.grid.x)[None] > a) | (abs(pair.grid.y)[:, None] > b)
         return cls(mask, edges, mask & ~edges & ~outside, mask & ~edges & outside)
@@ -124,6 +134,8 @@ def main() -> None:
     parser.add_argument("--others", type=float, nargs="*", default=[])
     parser.add_argument("--law", nargs="+", choices=LAWS, default=[], help="to regularise with")
     parser.add_argument("--element", type=float, nargs=2, default=[24.0, 12.0], metavar="PX")
+    parser.add_argument("--window", type=int, nargs=4, metavar="PX")
+    parser.add_argument("--no-free-edges", action="store_true")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     images = ImageSet.read(given.folder / "images")
@@ -131,13 +143,18 @@ def main() -> None:
     specimen = specimen_of(images)
     truth = images.pair(given.strain).truth
     assert truth is not None
-    best = best_fit(truth, start)
+    best = None if given.window else best_fit(truth, start)
     rows, head = [], "noise seed  cut-off     all   edges  ligam.    bulk longest   refit"
     print(f"{head}  covered (all, edges)  seconds (CPU)   GB  unknowns")
     for noise in given.noise:
         for seed, law in product(range(given.seeds), given.law or [""]):
             pair = noisy(images, given.strain, noise, seed)
-            options = FiniteElementOptions(*given.element, law=law_of(images, law) if law else None)
+            if given.window:
+                pair = windowed(pair, *given.window)
+            options = FiniteElementOptions(
+                *given.element, law=law_of(images, law) if law else None,
+                free_edges=not given.no_free_edges,
+            )  # fmt: skip
             row = measured(pair, start, best, specimen, noise, seed, given.mesh, options)
             rows.append(replace(row, law=law))
             show(rows[-1])
@@ -183,9 +200,26 @@ def noisy(images: ImageSet, strain: float, noise: float, seed: int) -> ImagePair
     return pair.with_images(f, g)
 
 
+def windowed(pair: ImagePair, top: int, bottom: int, left: int, right: int) -> ImagePair:
+    """A part of the images, whose mask is that of a window in it."""
+    grid, truth, mask = pair.grid, pair.truth, np.zeros(pair.grid.shape, dtype=np.bool_)
+    assert truth is not None
+    mask[top:bottom, left:right] = pair.masks[0][top:bottom, left:right]
+    counted = np.full(truth.displacement.shape, np.nan)
+    inner = np.s_[top + INSIDE_PX : bottom - INSIDE_PX, left + INSIDE_PX : right - INSIDE_PX]
+    counted[inner] = truth.displacement[inner]
+    top, left = max(0, top - MARGIN_PX), max(0, left - MARGIN_PX)
+    part = np.s_[top : bottom + MARGIN_PX, left : right + MARGIN_PX]
+    x, y = map(float, grid.to_mm(top, left))
+    rows, cols = mask[part].shape
+    own = PixelGrid(rows, cols, grid.pixel_size, x, y)
+    f, g, seen = (image[part] for image in (pair.reference, pair.deformed, pair.masks[1]))
+    return ImagePair(f, g, own, mask[part], seen, Truth.of(displacement=counted[part]))
+
+
 def measured(
-    pair: ImagePair, start: Result, best: Result, specimen: Specimen, noise: float, seed: int,
-    kind: str, options: FiniteElementOptions,
+    pair: ImagePair, start: Result, best: Result | None, specimen: Specimen, noise: float,
+    seed: int, kind: str, options: FiniteElementOptions,
 ) -> Row:  # fmt: skip
     """Measure, and set it against the truth."""
     px = pair.grid.pixel_size
@@ -199,14 +233,17 @@ def measured(
     error = (u - pair.truth.displacement) / px
     regions = Regions.of(pair, specimen)
     rms = {
-        name: float(np.sqrt(np.mean(error[there] ** 2))) for name, there in vars(regions).items()
+        name: float(np.sqrt(np.mean(error[there] ** 2))) if there.any() else np.nan
+        for name, there in vars(regions).items()
     }
     longest = float(np.linalg.norm(error[regions.all], axis=1).max())
-    fit = fit_displacement(u, pair.grid, start.ansatz, start.unknowns, pair.mask)
-    refit = (fit.displacement() - best.displacement())[regions.all] / px
+    apart = np.full(1, np.nan)
+    if best is not None:
+        fit = fit_displacement(u, pair.grid, start.ansatz, start.unknowns, pair.mask)
+        apart = (fit.displacement() - best.displacement())[regions.all] / px
     return Row(
         noise, seed, result.cutoff_px, **rms, longest=longest,
-        refit=float(np.sqrt(np.mean(refit**2))), covered=covered(result, error, regions),
+        refit=float(np.sqrt(np.mean(apart**2))), covered=covered(result, error, regions),
         unknowns=result.unknowns, seconds=wall, cpu_seconds=cpu, gigabytes=used,
         contradicted=result.contradicted,
         noticed=any("law" in text for text in result.warnings),
@@ -217,7 +254,7 @@ def covered(result: NodalResult, error: NDArray[Any], regions: Regions) -> dict[
     """Share of the components in their 95 % intervals."""
     sd = result.standard_deviation_on() / result.grid.pixel_size
     return {
-        name: float(np.mean(np.abs(error[there]) < 1.96 * sd[there]))
+        name: float(np.mean(np.abs(error[there]) < 1.96 * sd[there])) if there.any() else np.nan
         for name, there in vars(regions).items()
     }
 

@@ -13,6 +13,7 @@ from modeharvest.imaging.pair import ImagePair, Truth
 
 FloatArray = NDArray[np.float64]
 Displacement = Callable[[FloatArray], FloatArray]
+Material = Callable[[FloatArray], NDArray[np.bool_]]
 
 GRID = PixelGrid.centred(220, 260, 0.01)
 HALF_SIZE, RADIUS = np.array([1.1, 0.9]), 0.35
@@ -34,11 +35,13 @@ def quadratic_field(points: FloatArray) -> FloatArray:
     )
 
 
-def plate_pair(u: Displacement, noise: float = 0.0, seed: int = 0) -> ImagePair:
+def plate_pair(
+    u: Displacement, noise: float = 0.0, seed: int = 0, material: Material = is_material
+) -> ImagePair:
     """Images of the plate before and after a displacement u (..., 2) [mm], with its truth."""
     at = np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
     before, pattern = inverted(u, at, 1e-12), speckle(3, GRID)
-    mask, deformed_mask = is_material(at), is_material(before)
+    mask, deformed_mask = material(at), material(before)
     f = np.where(mask, pattern(at[..., 0], at[..., 1]), 0.0)
     g = np.where(deformed_mask, pattern(before[..., 0], before[..., 1]), 0.0)
     random = np.random.default_rng(seed)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from documented_keys import undocumented
+from explored import content_of, quantity, samples
 from manufactured import inverted, speckle
 from plate_with_hole import GRID, plate_pair, quadratic_field
 from test_cli import called, error_line
@@ -113,6 +114,13 @@ def test_summary(plate: Plate, measured: Path) -> None:
     assert summary["unit"] == "mm"
     page = (measured / "report.html").read_text()
     assert page.count("<svg") == 2 * 8
+    content = content_of(page)
+    for k, name in enumerate("ab"):
+        u = samples(content, plate.truth[name])
+        assert np.nanmax(np.abs(quantity(content, k, "u") - u[..., 0])) < GRID.pixel_size
+        strain = quantity(content, k, "exx")
+        assert np.nanmedian(np.abs(strain - np.gradient(u[..., 0], axis=1) / GRID.pixel_size
+                                   / content["factor"])) < 0.01  # fmt: skip
 
 
 @pytest.mark.usefixtures("undrawn_pictures")

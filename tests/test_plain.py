@@ -13,22 +13,19 @@ from scipy.optimize import brentq
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import stress_and_tangent
+from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.contours import (
     ELASTOMER,
-    Contour,
     displacement_from_contours,
     straight_sides,
 )
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.photograph.plain import (
-    HoleShape,
-    displacement_of_plain,
-    matched_contours,
-    plain_surface,
-)
+from modeharvest.idic.photograph.plain import displacement_of_plain, matched_contours, plain_surface
+from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
-from modeharvest.imaging.photographs.files import read_image
+from modeharvest.imaging.photographs.contour import Contour, HoleShape
+from modeharvest.imaging.photographs.files import read_image, read_mask, write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
@@ -229,15 +226,62 @@ def test_holes_that_are_not_found_again_leave_a_warning() -> None:
     assert any("1 holes weren't found again" in warning for warning in result.warnings)
 
 
-def test_harvest_says_what_measures_a_plain_specimen(photographed: Path, tmp_path: Path) -> None:
-    case = tmp_path / "test.toml"
+@pytest.fixture
+def experiment(photographed: Path, tmp_path: Path) -> Path:
+    """Of a photograph without speckle, and one with."""
     names = [photographed / f"{name}_8bit.tif" for name in ("reference", "deformed_1280")]
-    case.write_text(
-        f'[images]\nreference = "{names[0]}"\ndeformed = ["{names[1]}"]\n'
+    plain = read_image(names[0])
+    speckle = gaussian_filter(np.random.default_rng(0).standard_normal(plain.shape), 2.0)
+    painted = plain + 300.0 * speckle * (plain > 0.5 * plain.max())
+    write_image(tmp_path / "painted.tif", np.clip(painted, 0, 255).astype(np.uint8))
+    path = tmp_path / "test.toml"
+    path.write_text(
+        f'[images]\nreference = "{names[0]}"\ndeformed = ["{names[1]}", "painted.tif"]\n'
         "[scale]\npixel_size = 0.04\n[specimen]\ncell_size = 1.9\n"
     )
-    with pytest.raises(InputError, match=r"got a plain one; .* by 'modeharvest measure'"):
-        harvest(case, tmp_path / "out")
+    return path
+
+
+def test_harvest_finds_modes_by_contours(
+    photographed: Path, experiment: Path, tmp_path: Path
+) -> None:
+    summary = harvest(experiment, tmp_path / "out")
+    (frame,), (skipped,) = summary["frames"], summary["skipped"]
+    assert skipped["name"] == "painted.tif"
+    assert skipped["reason"].startswith("expected a specimen without speckle in ")
+    assert frame["shown"] == "contours"
+    assert frame["has_pattern"]
+    assert frame["outcome"] == "converged"
+    assert frame["residual_rms"] is None
+    assert frame["whole_field"]["cutoff_px"] is None
+    assert frame["whole_field"]["residual_rms"] < 0.05  # px
+    (mode,) = frame["modes"]
+    for wave in mode["waves"]:  # of infinitely many cells (1/2, 1/2)
+        assert np.allclose(np.abs(wave["xi"]), 0.5, rtol=0.005)
+    specimen = Solution.read(SHIPPED).specimen
+    assert specimen
+    (pair,) = make_images(Solution.read(SHIPPED), PLAIN, photographed, (0.128,))
+    result = Result.read(tmp_path / "out/results/deformed_1280_8bit.json")
+    u, mask = pair.truth.displacement, read_mask(tmp_path / "out/prepared/reference_mask.tif")
+    inside = mask & np.isfinite(u[..., 0])
+    best = fit_displacement(u, pair.grid, result.ansatz, result.unknowns, inside)
+    v, best_v = (fit.v(0)[mask] for fit in (result, best))
+    assert np.abs(v - best_v).max() < 0.02 * np.abs(best_v).max()
+    assert len((tmp_path / "out/results/deformed_1280_8bit_holes.csv").read_text().split()) > 60
+    # Noise is the least of what this is uncertain by.
+    errors = frame["errors_px"]
+    assert 0.0 < errors["noise"]["fluctuation"] < errors["model_error"]["fluctuation"] < 0.1
+    assert harvest(experiment, tmp_path / "out")["frames"] == [frame]  # as read from its files
+
+
+def test_a_local_dic_of_a_specimen_without_speckle_is_refused(
+    experiment: Path, tmp_path: Path
+) -> None:
+    np.savetxt(tmp_path / "u.csv", np.zeros((4, 4)), delimiter=",", header="x,y,u,v", comments="")
+    text = experiment.read_text().replace(', "painted.tif"', "")
+    experiment.write_text(text + '[local]\ncode = "file"\nfiles = ["u.csv"]\n')
+    with pytest.raises(InputError, match="measured by its contours; leave"):
+        harvest(experiment, tmp_path / "out")
 
 
 def test_pictures_that_are_not_plain_or_not_whole() -> None:

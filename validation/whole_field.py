@@ -34,7 +34,7 @@ class WholeFieldSummary:
     max_px: float = quantity("… largest length", "px")
     coverage: float = quantity("… share of the material measured", "–")
     rms_refit_to_best_fit_px: float = quantity("… refitted ansatz − best fit, rms", "px")
-    cutoff_px: float = quantity("… cut-off wavelength of the regularisation", "px")
+    cutoff_px: float | None = quantity("… cut-off wavelength of the regularisation", "px")
     unknowns: int = quantity("… unknowns", "–")
     interval_coverage: float = quantity("… truth within 95 % intervals", "–")
     """Share of the components of all pixels."""
@@ -72,9 +72,9 @@ class WholeFieldNumbers:
     rms_refit_to_idic_px: float = quantity("refitted ansatz − IDIC, rms", "px")
     sd_px: float = quantity("standard deviation of the measured displacement, rms", "px")
     coverage: float = quantity("share of the material measured", "–")
-    cutoff_px: float = quantity("cut-off wavelength of the regularisation", "px")
+    cutoff_px: float | None = quantity("cut-off wavelength of the regularisation", "px")
     unknowns: int = quantity("unknowns", "–")
-    residual_rms: float = quantity("residual, rms", "levels")
+    residual_rms: float = quantity("residual, rms", "levels; contours: px")
     modes: tuple[ModeBothWays, ...]
     library: str
     """That factorised the matrices."""

@@ -16,11 +16,8 @@ Contours don't show whether it does; what sliding would change counts in the sta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.sparse import csr_array, diags_array
 from scipy.spatial import cKDTree
 
@@ -32,6 +29,7 @@ from modeharvest.idic.finite_element.fields import interpolation_error, nodal_gr
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import SAMPLES, Body, Imbalance
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.photographs.contour import Contour, SeenContours
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, counted, silent
@@ -46,8 +44,6 @@ _PLATE = 1e6
 """Stiffness along edges that don't slide [shear modulus times px]."""
 _FAR_PX = 3.0
 """The mesh's edge is off the contour of the reference by less, or that contour is not known."""
-_FINE_PX = 0.25
-"""Between the points of a contour among which the nearest is sought."""
 _CORNER = np.deg2rad(35.0)
 _LEAST_SIDE, _STRAIGHT, _STAYS_STRAIGHT = 0.2, 2e-3, 5e-3
 """Length of a straight edge over that of the body, at least, and how far off a straight line it
@@ -57,71 +53,11 @@ _LOADED = 0.3
 _GAUSS, _WEIGHTS = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6), np.array([5, 8, 5]) / 18.0
 _ROUGH_PX, _TOLERANCE_PX, _STEPS = 1.0, 0.01, 60
 _LEAST_DET = 0.02
-_CORRELATED_PX = 2.5
-"""Length over which the noise of a contour's points is correlated, about."""
 _PROBES = 4
 _ASTRAY = "The displacement from contours didn't converge: don't use it; give pictures in between."
 _TRIANGULAR, _RECTANGULAR = 6.0, 3.0
 """Half-width squared over variance of such distributions: of what is most likely in the middle, and
 of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
-
-
-class Contour:
-    """A closed smooth curve through points (n, 2) [mm], each once."""
-
-    def __init__(self, points: FloatArray) -> None:
-        closed = np.vstack([points, points[:1]])
-        length = np.linalg.norm(np.diff(closed, axis=0), axis=1)
-        keep = np.append(length > 1e-3 * np.median(length), True)
-        closed, s = closed[keep], np.concatenate([[0.0], np.cumsum(length[keep[:-1]])])
-        self.points, self.length = np.asarray(closed[:-1], np.float64), float(s[-1])
-        closed[-1] = closed[0]
-        self._curve = CubicSpline(s, closed, bc_type="periodic")
-
-    @cached_property
-    def _fine(self) -> tuple[FloatArray, cKDTree]:
-        step = _FINE_PX * self.length / len(self.points)
-        s = np.linspace(0.0, self.length, int(self.length / step), endpoint=False)
-        return np.asarray(s, dtype=np.float64), cKDTree(self._curve(s))
-
-    @cached_property
-    def moments(self) -> tuple[float, FloatArray, FloatArray]:
-        """Signed area [mm^2], centroid (2,) [mm], second central moments (2, 2) over it [mm^2]."""
-        p, q = self.points, np.roll(self.points, -1, axis=0)
-        cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-        area = 0.5 * float(cross.sum())
-        centre = (p + q).T @ cross / (6.0 * area)
-        a, b = p - centre, q - centre
-        around = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-        pairs = np.einsum("ni,nj->nij", a + b, a + b) + np.einsum("ni,nj->nij", a, a)
-        second = np.einsum("nij,n->ij", pairs + np.einsum("ni,nj->nij", b, b), around)
-        return area, np.asarray(centre, np.float64), np.asarray(second / (24.0 * area))
-
-    def distance(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) signed distance of points (n, 2) from the curve [mm], and (n, 2) its gradient."""
-        fine, tree = self._fine
-        s, step = fine[tree.query(x)[1]], self.length / len(self.points)
-        for _ in range(3):
-            off, along, bent = self._curve(s) - x, self._curve(s, 1), self._curve(s, 2)
-            square = (along**2).sum(axis=1)
-            slope = square + (off * bent).sum(axis=1)
-            slope = np.where(slope > 0.2 * square, slope, square)
-            s = np.mod(s - np.clip((off * along).sum(axis=1) / slope, -step, step), self.length)
-        along = self._curve(s, 1)
-        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return ((x - self._curve(s)) * normal).sum(axis=1), normal
-
-
-@dataclass(frozen=True, eq=False)
-class SeenContours:
-    """Contours of one and the same edges in two images."""
-
-    reference: tuple[Contour, ...]
-    deformed: tuple[Contour, ...]
-    """One after the other, gone along in the same sense [mm]."""
-    noise: float
-    """Variance of their distance times the length over which it is correlated [mm^3]."""
 
 
 class _Edge:
@@ -388,11 +324,10 @@ def displacement_from_contours(
         gradient_covariance=sd.gradient,
         roots=sd.roots,
         grid=grid,
-        cutoff_px=0.0,
+        cutoff_px=None,
         tried=(),
         residual_rms=float(np.sqrt(np.average(d**2, weights=state.edge.length))) / grid.pixel_size,
-        residual_noise=float(np.sqrt(seen.noise / _CORRELATED_PX / grid.pixel_size))
-        / grid.pixel_size,
+        residual_noise=float(np.sqrt(seen.noise / seen.correlated)) / grid.pixel_size,
         pixels=int(state.edge.length.sum() / grid.pixel_size),
         outside=int((state.edge.length == 0.0).sum()),
         effective_unknowns=known,

@@ -41,7 +41,7 @@ import numpy as np
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.fields import interpolation_error, mean_around, nodal_gradient
-from modeharvest.idic.finite_element.system import SAMPLES, Linearised, Smoothness
+from modeharvest.idic.finite_element.system import SAMPLES, SOME, Linearised, Smoothness
 from modeharvest.util.arrays import FloatArray, IntArray
 
 _PROBES = 4
@@ -57,8 +57,8 @@ _OF_SLOPES = 2.0
 """Bias of gradients over what that shows: waves that are gone (half, in k^-3.5) can't change."""
 _SIGNIFICANT = 3.0
 """Standard deviations."""
-_STANDS_OUT, _SOME = 6.0, 8
-"""Square of what smoothing takes over its variance, around a node; random vectors to know that."""
+_STANDS_OUT = 6.0
+"""Square of what smoothing takes over its variance, around a node."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,7 @@ def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> 
     """Estimate the risk of one cut-off wavelength; ``excess`` is c."""
     weight = at.weight(cutoff_px * pixel_size)
     z = np.random.default_rng(0).choice([-1.0, 1.0], (at.u.size, _PROBES))
-    right = at.gradient - weight * at.penalty
-    found = at.factor(weight).solve(np.column_stack([right, at.M @ z]))
+    found = at.factor(weight).solve(np.column_stack([at.right(weight), at.M @ z]))
     step = found[:, 0]
     Q = at.sums.square_sum - 2.0 * float(step @ at.gradient) + float(step @ (at.M @ step))
     t = float(np.sum(z * found[:, 1:])) / _PROBES
@@ -171,6 +170,8 @@ def deviations(
     pull = (at.gain * at.signal)[:, None, None] * at.sums.gradient
     blocks = (noise**2 * in_gradient)[:, None, None, None] * at.sums.blocks
     random, inflation = at.body.samples(blocks, pull, degrees * (1.0 - unknowns / degrees.sum()))
+    if at.edges is not None:
+        random += at.variance * at.edges.samples(at.u, SAMPLES)
     found = factor.solve(random).reshape(-1, 2, SAMPLES)
     lost = none = found[..., :0]
     taken = share = np.zeros_like(error := interpolation_error(mesh, at.u.reshape(-1, 2)))
@@ -182,9 +183,9 @@ def deviations(
         rough = weight * grown / max(noise**2 * unknowns, _TINY)
         wide = noise * np.sqrt(weight * blank * max(at.mean(in_gradient), rough))
         found += wide[:, None, None] * lost
-        noisy = at.R @ found[..., :_SOME].reshape(at.u.size, _SOME)
+        noisy = at.R @ found[..., :SOME].reshape(at.u.size, SOME)
         both = weight * factor.solve(np.column_stack([at.penalty, noisy]))
-        taken, *by_noise = np.moveaxis(both.reshape(-1, 2, 1 + _SOME), 2, 0)
+        taken, *by_noise = np.moveaxis(both.reshape(-1, 2, 1 + SOME), 2, 0)
         variance = np.mean(np.square(by_noise), axis=0) / inflation[:, None] + error**2
         beyond = smoothed(mesh, taken**2 - _STANDS_OUT * variance).sum(axis=1, keepdims=True)
         share = smoothed(mesh, (beyond > 0.0).astype(float))
@@ -197,6 +198,15 @@ def deviations(
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
     sd = Deviations(found, lost, none, error, spread, share * taken)
     return sd.with_bias(mesh, change, _OF_SLOPES)._replace(changes=missing[..., None])
+
+
+def uncertain(at: Linearised, cutoff: float, noise: FloatArray) -> FloatArray:
+    """(2 n, SOME + 1) noise and bias of u [mm], whose outer products sum up to its covariance."""
+    random = at.body.random(noise[:, None, None, None] * at.sums.blocks, SOME)
+    here = at.right(weight := at.weight(cutoff))
+    found = at.factor(weight).solve(np.column_stack([here, random]))
+    change = at.step(cutoff, _STRONGER) - found[:, 0]
+    return np.column_stack([found[:, 1:] / np.sqrt(SOME), _OF_SLOPES * change])
 
 
 def contradicted(

@@ -103,6 +103,13 @@ FIELDS: dict[str, Field] = {
     "green_lagrange": Field(_SYMMETRIC, lambda F, _: 0.5 * (F.swapaxes(-1, -2) @ F - np.eye(2))),
     "logarithmic": Field(_SYMMETRIC, lambda F, _: _logarithmic(F)),
     "J": Field("", lambda F, _: determinant(F)),
+    "rotation": Field(
+        "",
+        lambda F, _: np.degrees(
+            np.arctan2(F[..., 1, 0] - F[..., 0, 1], F[..., 0, 0] + F[..., 1, 1])
+        ),
+        "deg",
+    ),
     "stretch_1": Field("", lambda F, _: stretches(F)[0]),
     "stretch_2": Field("", lambda F, _: stretches(F)[1]),
     "direction_1": Field("x y", lambda F, _: _direction(F)),
@@ -112,9 +119,10 @@ FIELDS: dict[str, Field] = {
         "", _of_material(lambda law, F: np.asarray(law.energy(JetMatrix(F)).value)), "MPa", True
     ),
 }
-"""By their names: F; J = det F; the larger and smaller principal stretch and the larger one's
-direction in the reference; E = (F'F - I)/2; Hencky's ln U, U^2 = F'F; in plane strain the first
-Piola-Kirchhoff stress P = dW/dF, Cauchy's PF'/J, and the energy W of the reference's volume.
+"""By their names: F; J = det F; the angle of R in F = RU, counter-clockwise; the larger and smaller
+principal stretch and the larger one's direction in the reference; E = (F'F - I)/2; Hencky's ln
+U, U^2 = F'F; in plane strain the first Piola-Kirchhoff stress P = dW/dF, Cauchy's PF'/J, and the
+energy W of the reference's volume.
 """
 
 

@@ -4,7 +4,7 @@ The HDF5 file can be read with h5py alone::
 
     nodes (n, 2)    cells (m, 6)    @element @format @unit @info (JSON: all that is not an array)
     displacement, start, standard_deviation, noise_deviation (n, 2)    each with @unit
-    gradient_covariance (n, 4, 4)
+    gradient_covariance (n, 4, 4)    roots (n, 2, k) float16, over @largest, of u's covariance
     fields/NAME (n, ...) float32, with @unit: what follows from them, see ``fields.FIELDS``
 
 Lengths are in mm, or in px where the size of a pixel isn't known; ``Given.unit`` says which.
@@ -68,6 +68,12 @@ def write_result(path: Path | str, result: NodalResult, given: Given = NO_MORE) 
         write_mesh(file, result.mesh)
         for name in _ARRAYS:
             file.create_dataset(name, data=getattr(result, name), **COMPRESSED)
+        if (roots := result.roots) is not None:
+            largest = float(np.abs(roots).max()) or 1.0
+            data = file.create_dataset(
+                "roots", data=(roots / largest).astype(np.float16), **COMPRESSED
+            )
+            data.attrs["largest"] = largest
         for name in field_names(given):
             if name in _ARRAYS:
                 continue
@@ -79,7 +85,7 @@ def write_result(path: Path | str, result: NodalResult, given: Given = NO_MORE) 
             file[name].attrs["unit"] = "" if name == "gradient_covariance" else given.unit
 
 
-def read_result(path: Path | str) -> NodalResult:
+def read_result(path: Path | str, with_roots: bool = False) -> NodalResult:
     """Read what :func:`write_result` wrote; InputError if the file is missing, cut or foreign."""
     with open_hdf5(path, "a measured displacement (HDF5)", "measure again", FORMAT) as file:
         mesh, info = read_mesh(file), json.loads(file.attrs["info"])
@@ -94,6 +100,8 @@ def read_result(path: Path | str) -> NodalResult:
                     f"{values.shape} with {int((~np.isfinite(values)).sum())} that are not"
                 )
         plain: dict[str, Any] = {name: made(_TYPES[name], info[name]) for name in _PLAIN}
+        if with_roots and (data := file.get("roots")) is not None:
+            plain["roots"] = float(data.attrs["largest"]) * data[()].astype(np.float64)
         return NodalResult(mesh=mesh, **plain | arrays)
 
 
@@ -134,7 +142,7 @@ def write_vtu(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> 
         in_space(result.mesh, fields).write(temporary, file_format="vtu")
 
 
-def _components(name: str, values: FloatArray, unit: str) -> dict[str, FloatArray]:
+def components(name: str, values: FloatArray, unit: str) -> dict[str, FloatArray]:
     """The components (...) of a field, by what they are called in tables."""
     if name in _VECTORS:
         labels = [f"{label} [{unit}]" for label in _VECTORS[name]]
@@ -156,7 +164,7 @@ def write_csv(
     row, col = result.grid.to_px(x, y)
     columns = {f"x [{given.unit}]": x, f"y up [{given.unit}]": y, "row": row, "column": col}
     for name in field_names(given):
-        columns |= _components(name, field_at(result, name, points, given), given.unit)
+        columns |= components(name, field_at(result, name, points, given), given.unit)
     table = np.column_stack(list(columns.values()))
     with atomic(path) as temporary:
         np.savetxt(temporary, table, "%.9g", ",", header=",".join(columns), comments="")
@@ -176,7 +184,7 @@ def write_maps(
     paths = []
     for name in names:
         values = field_at(result, name, result.grid, given)
-        for label, component in _components(name, values, given.unit).items():
+        for label, component in components(name, values, given.unit).items():
             plain = label.replace(" up", "").replace(" [", "_").replace("]", "")
             paths.append(stem.with_name(f"{stem.name}_{plain}.tif"))
             write_image(paths[-1], component)

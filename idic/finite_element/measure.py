@@ -23,6 +23,7 @@ from modeharvest.idic.finite_element.cutoff import (
     deviations,
     least_risk,
     risk,
+    uncertain,
 )
 from modeharvest.idic.finite_element.fields import determinant, element_gradients
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
@@ -39,6 +40,7 @@ from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body, Imbalance, Linearised, Smoothness
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
+from modeharvest.idic.solver.free_edges import FreeEdges
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, eroded, smoothed
 from modeharvest.idic.solver.weighting import best_blur
@@ -55,7 +57,7 @@ _FIRST_PX = 18.0
 _FIRST_WITH_LAW_PX = 150.0
 _WRONG = 0.075
 """Share of the edges' nodes that contradict a law beyond which it is said to be wrong; not 0.003,
-because smoothing takes more away at edges than bars know. Measured values: docs/whole_field.md.
+because smoothing takes more away at edges than bars know (docs/explanation/whole_field.md).
 """
 _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
@@ -67,6 +69,8 @@ _LEAST_DET = 0.1
 _UNLIKE, _SEEN = 0.25, 0.25
 """Images don't match in an element with a larger mean square residual, over the reference's
 variance, or with a smaller share of its pixels found on the deformed image's material."""
+_BORDER_PX = 2.0
+"""Edges this close to the image's border aren't the body's [px]."""
 _ROUNDS = 3
 _SETTLED = 0.5
 """Relative change of the cut-off wavelength that needs no other round."""
@@ -117,6 +121,8 @@ class FiniteElementOptions:
     """
     steps: int = 4
     """Of Gauss-Newton in each stage, at most."""
+    free_edges: bool = True
+    """Whether to measure with what free edges have in common, without a law: see ``free_edges``."""
 
     def __post_init__(self) -> None:
         what = "finite-element DIC: expected"
@@ -220,6 +226,7 @@ class _Measurement:
         self.kept: Linearised | None = None
         self.free: tuple[FloatArray, Deviations] | None = None
         self.contradicted: float | None = None
+        self.edges: FreeEdges | None = None
         self.tried: tuple[Risk, ...] = ()
         self.warnings = body.changes
         images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
@@ -278,7 +285,7 @@ class _Measurement:
         gradient = body.vector(gain * signal[:, None, None] * sums.gradient)
         sums = replace(sums, blocks=blocks)
         self.kept = Linearised(
-            body, self.prior, self.u, sums, signal, gain, M, gradient, R, penalty, ratio
+            body, self.prior, self.u, sums, signal, gain, M, gradient, R, penalty, ratio, self.edges
         )
         return self.kept
 
@@ -304,12 +311,26 @@ class _Measurement:
         self._prepare(FULL)
         law, given = self.options.law, self.options.cutoff_px
         self._regularised(_FIRST_PX, None if law is not None else given)
-        if law is not None:
+        if law is None and self.options.free_edges:
+            self._through_edges()
+        elif law is not None:
             mesh = self.body.mesh
             self.free = self.u.copy(), self._assessed()[2]
             self.prior = Imbalance(mesh, law.material, law.loaded(mesh.nodes))
             self.kept = None
             self._regularised(_FIRST_WITH_LAW_PX, given)
+
+    def _through_edges(self) -> None:
+        """Learn what free edges have in common, and measure with that, too."""
+        at, px = self.linearised(), self.pair.grid.pixel_size
+        left, right, bottom, top = self.pair.grid.extent
+        off = _BORDER_PX * px
+        edges = FreeEdges(self.body.mesh, (left + off, right - off, bottom + off, top - off))
+        noise = at.variance * self._noise_in(at)
+        edges.learn(at.u, uncertain(at, self.cutoff_px * px, noise))
+        if edges.deviation:
+            self.edges = edges
+            self.through(_Stage(FULL, self.cutoff_px, _LAST_TOLERANCE_PX))
 
     def _assessed(self) -> tuple[Linearised, Risk, Deviations]:
         """What there is at the present displacement."""
@@ -382,8 +403,8 @@ class _Measurement:
         left = normal_equations(pixels, body.mesh, on.images, at.u.reshape(-1, 2), on.continued)
         share = at.gain * at.signal[:, None, None]
         M = body.matrix(share[..., None] ** 2 * left.blocks)
-        rest = body.vector(share * left.gradient) - weight * at.penalty
-        return body.factor(M, at.R, weight).solve(rest).reshape(-1, 2, 1)
+        others = replace(at, M=M, gradient=body.vector(share * left.gradient))
+        return others.factor(weight).solve(others.right(weight)).reshape(-1, 2, 1)
 
     def result(self) -> NodalResult:
         """Make the result, with its standard deviations."""

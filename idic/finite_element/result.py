@@ -54,9 +54,9 @@ class NodalResult:
     """(n, 4, 4) of the components xx, xy, yx, yy of F by noise and smoothing [-]."""
     grid: PixelGrid
     """The pixels of the images."""
-    cutoff_px: float
+    cutoff_px: float | None
     tried: tuple[Risk, ...]
-    """Cut-off wavelength of the regularisation [px], and those that were tried to find it."""
+    """Cut-off wavelength of the regularisation [px], if any, and those that were tried for it."""
     residual_rms: float
     residual_noise: float
     pixels: int
@@ -73,7 +73,8 @@ class NodalResult:
     """Share of free edges' nodes where a law changes u significantly; None without one [-]."""
     shown: str = "speckle"  # or "contours", of which residuals are distances [px]
     roots: FloatArray | None = None
-    """(n, 2, k) whose outer products sum up to the covariance of all nodes [mm]; in no file."""
+    """(n, 2, k) whose outer products sum up to the covariance of all nodes [mm]; of a result that
+    was read, if they were wanted."""
 
     @property
     def unknowns(self) -> int:

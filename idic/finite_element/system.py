@@ -23,6 +23,7 @@ M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the mo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.idic.finite_element.fields import mean_around, nodal_sums
 from modeharvest.idic.finite_element.pixels import MeshPixels, NodalEquations
+from modeharvest.idic.solver.free_edges import FreeEdges, on_sides
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
 from modeharvest.util.elements import reference_element, shape_gradients
@@ -44,6 +46,9 @@ _LEAST_DET = 0.05
 """Points of an element that shrink to less have no part in it: an iteration gone astray."""
 SAMPLES = 32
 """Of random vectors: standard deviations by them are known to 13 %."""
+SOME = 8
+"""Of random vectors, where less will do."""
+_TINY = 1e-200
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
 
 
@@ -114,21 +119,6 @@ def second_gradients(mesh: Mesh) -> FloatArray:
     return np.asarray(found.mean(axis=1))
 
 
-def _on_sides(
-    mesh: Mesh, cells: IntArray, sides: IntArray, at: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Gradients of the shape functions on sides of cells (s,), and how fast these are gone along.
-
-    ``at`` (g,): of a side, from 0 to 1. Returns (s, g, k, 2) [1/mm] and (s, g) [mm].
-    """
-    corners = reference_element(mesh.element).nodes[:3]
-    begin, along = corners[sides], corners[(sides + 1) % 3] - corners[sides]
-    local = shape_gradients(mesh.element, begin[:, None] + at[:, None] * along[:, None])
-    F = np.einsum("ski,sgkj->sgij", mesh.nodes[mesh.cells[cells]], local)
-    speed = np.linalg.norm(np.einsum("sgij,sj->sgi", F, along), axis=-1)
-    return np.einsum("sgkj,sgji->sgki", local, np.linalg.inv(F)), speed
-
-
 class SmoothnessRoots(NamedTuple):
     """What R is made of, side by side: a part is its roots times their transpose."""
 
@@ -142,8 +132,9 @@ class SmoothnessRoots(NamedTuple):
     def of(cls, mesh: Mesh) -> SmoothnessRoots:
         """Of a T6 mesh."""
         curved, (first, side, second, other) = second_gradients(mesh), interior_sides(mesh.cells).T
-        here, speed = _on_sides(mesh, first, side, _GAUSS)
-        there, _ = _on_sides(mesh, second, other, 1.0 - _GAUSS)  # which goes the other way
+        _, here, along = on_sides(mesh, first, side, _GAUSS)
+        there = on_sides(mesh, second, other, 1.0 - _GAUSS)[1]  # which goes the other way
+        speed = np.linalg.norm(along, axis=-1)
         shares = 0.5 * speed / speed.mean(axis=1, keepdims=True)
         corners = mesh.nodes[mesh.cells[first, (side + 1) % 3]], mesh.nodes[mesh.cells[first, side]]
         h = np.linalg.norm(corners[0] - corners[1], axis=1)
@@ -239,11 +230,8 @@ class Body:
         ``pull`` (m, 6, 2): what there is of them, of (m,) degrees of freedom. What is alike over an
         element, its own error first of all, pulls its nodes more than noise as large.
         """
-        n, m, cells = len(self.mesh.nodes), len(M), self.mesh.cells
-        M = M[:, [[0, 1], [1, 2]]].transpose(0, 3, 1, 4, 2).reshape(m, 12, 12)
-        # Elements with few pixels have singular blocks.
-        M[:, range(12), range(12)] *= 1.0 + 1e-9
-        M[:, range(12), range(12)] += 1e-12 * M.max()
+        m, cells = len(M), self.mesh.cells
+        M = _definite(M)
         ridge = 1e-4 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(12)
         moved = np.linalg.solve(M + ridge, pull.reshape(m, 12, 1))[..., 0]
         square = (pull.reshape(m, 12) * moved).sum(axis=1)
@@ -251,8 +239,24 @@ class Body:
         found, expected = mean_around(self.mesh, own).T
         inflation = np.maximum(found / np.maximum(expected, 1.0), 1.0)
         M *= inflation[cells].mean(axis=1)[:, None, None]
-        z = np.linalg.cholesky(M) @ np.random.default_rng(0).standard_normal((m, 12, SAMPLES))
-        return nodal_sums(n, cells, z.reshape(m, 6, -1)).reshape(2 * n, -1), inflation
+        return self._random(M, SAMPLES), inflation
+
+    def random(self, M: FloatArray, count: int) -> FloatArray:
+        """(2 n, count) random vectors of the covariance M (m, 3, 6, 6)."""
+        return self._random(_definite(M), count)
+
+    def _random(self, M: FloatArray, count: int) -> FloatArray:
+        n, m = len(self.mesh.nodes), len(M)
+        z = np.linalg.cholesky(M) @ np.random.default_rng(0).standard_normal((m, 12, count))
+        return nodal_sums(n, self.mesh.cells, z.reshape(m, 6, -1)).reshape(2 * n, -1)
+
+
+def _definite(M: FloatArray) -> FloatArray:
+    """(m, 12, 12) blocks (m, 3, 6, 6) of elements, of which those with few pixels are singular."""
+    M = M[:, [[0, 1], [1, 2]]].transpose(0, 3, 1, 4, 2).reshape(len(M), 12, 12)
+    M[:, range(12), range(12)] *= 1.0 + 1e-9
+    M[:, range(12), range(12)] += max(1e-12 * M.max(), _TINY)
+    return M
 
 
 class Smoothness:
@@ -335,6 +339,8 @@ class Linearised:
     """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
     ratio: float
     """Of M to R, by the body's waves."""
+    edges: FreeEdges | None = None
+    """That are known beside the images, as well as the noise of their residual is."""
 
     def mean(self, values: FloatArray) -> float:
         """Mean over the pixels of values (m,) of the elements."""
@@ -344,11 +350,28 @@ class Linearised:
         """The weight lambda of R for a cut-off wavelength [mm]."""
         return (cutoff / self.body.wavelength) ** self.prior.power * self.ratio
 
+    @property
+    def variance(self) -> float:
+        """Of the residual [grey levels^2]."""
+        return self.sums.rms**2
+
+    @cached_property
+    def known(self) -> tuple[csr_array, FloatArray]:
+        """M and the gradient, with what is known of edges."""
+        if self.edges is None:
+            return self.M, self.gradient
+        E, e = self.edges.linearised(self.u)
+        return csr_array(self.M + self.variance * E), self.gradient + self.variance * e
+
     def factor(self, weight: float) -> Factor:
-        """M + lambda R, factorised."""
-        return self.body.factor(self.M, self.R, weight)
+        """M + lambda R, factorised, and what is known of edges."""
+        return self.body.factor(self.known[0], self.R, weight)
+
+    def right(self, weight: float) -> FloatArray:
+        """(2 n,) right-hand side of a step."""
+        return self.known[1] - weight * self.penalty
 
     def step(self, cutoff: float, times: float = 1.0) -> FloatArray:
         """(2 n,) Gauss-Newton step for a cut-off wavelength [mm], or so many times its weight."""
         weight = times * self.weight(cutoff)
-        return self.factor(weight).solve(self.gradient - weight * self.penalty)
+        return self.factor(weight).solve(self.right(weight))

@@ -54,7 +54,7 @@ from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.progress import Progress, silent
 
-_POINTS_A_CELL = 24
+POINTS_A_CELL = 24
 """Along a cell, of the whole displacement's values that spectra are taken of."""
 _REFITTED = (
     "From the best start there is the correlation ended in a local minimum: the result is the "
@@ -145,13 +145,8 @@ def measure(
         blocks = match_blocks(pair, expected_by(known, pair.grid))
         require_same_surface(blocks)
         matching += f" v0 starts from the photograph before. {blocks.text}"
-    boxes = list(geometry.parts.values())
-    guess = initial_guess(
-        pair, cell_size, boxes, local=local, holes=holes, lattice=geometry.lattice_mm,
-        domain=geometry.region.domain, options=how,
-    )  # fmt: skip
-    ansatz, unknowns = chosen_modes(guess, geometry, cell_size, how)
-    text = (matching, *_guess_text(guess, ansatz, geometry))
+    guess, ansatz, unknowns, text = found_modes(pair, geometry, cell_size, how, local, holes)
+    text = (matching, *text)
     options, found = how.options(), None
     if before is not None and _goes_on(before.result, ansatz, unknowns):
         again, there = _with_brightness(before.result, how)
@@ -191,12 +186,9 @@ def measure_whole(
     expected = float(np.hypot(noise.reference, noise.deformed))
     misfit = misfit_of(measured, expected, pair.reference[pair.masks[0]])
     warnings = (*first.warnings, *measured.warnings, *misfit)
-    guess = initial_guess(
-        pair, cell_size, list(geometry.parts.values()),
-        local=measured.at_points(cell_size / _POINTS_A_CELL), lattice=geometry.lattice_mm,
-        domain=geometry.region.domain, options=how,
-    )  # fmt: skip
-    ansatz, unknowns = chosen_modes(guess, geometry, cell_size, how)
+    guess, ansatz, unknowns, reading = found_modes(
+        pair, geometry, cell_size, how, measured.at_points(cell_size / POINTS_A_CELL)
+    )
     now, before = (sum(mode.family.size for mode in one.modes) for one in (ansatz, found.ansatz))
     if now >= before and _goes_on(found, ansatz, unknowns):
         refit = refitted(measured, found.ansatz, found.unknowns, mask)
@@ -207,7 +199,7 @@ def measure_whole(
         )
         text = (
             first.text[0],
-            *_guess_text(guess, ansatz, geometry),
+            *reading,
             f"A first correlation, of other modes, ended as “{first.result.outcome.value}”; this "
             "one started from the ansatz fitted to the whole displacement.",
             *([found.final_smoothing.text] if found.final_smoothing else ()),
@@ -216,6 +208,19 @@ def measure_whole(
             warnings = (*warnings, _REFITTED)
     whole = WholeField(measured, refit, start=start)
     return MeasuredPhotograph(found, guess.local, text, whole, warnings)
+
+
+def found_modes(
+    pair: ImagePair, geometry: Geometry, cell_size: float, how: PhotographOptions,
+    local: LocalField | None, holes: LocalField | None = None,
+) -> tuple[InitialGuess, Ansatz, FloatArray, tuple[str, ...]]:  # fmt: skip
+    """An initial guess, the ansatz and the unknowns that are chosen from it, and how, in words."""
+    guess = initial_guess(
+        pair, cell_size, list(geometry.parts.values()), local=local, holes=holes,
+        lattice=geometry.lattice_mm, domain=geometry.region.domain, options=how,
+    )  # fmt: skip
+    ansatz, unknowns = chosen_modes(guess, geometry, cell_size, how)
+    return guess, ansatz, unknowns, _guess_text(guess, ansatz, geometry)
 
 
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:

@@ -14,20 +14,22 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, label
+from scipy.ndimage import gaussian_filter, label
 from scipy.optimize import linear_sum_assignment
+from scipy.signal import savgol_filter
 from skimage.filters import threshold_otsu
 
-from modeharvest.idic.finite_element.contours import (
-    Contour,
-    SeenContours,
-    displacement_from_contours,
-)
+from modeharvest.idic.finite_element.contours import displacement_from_contours
 from modeharvest.idic.finite_element.mesh import find_contours
-from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.finite_element.system import Body
+from modeharvest.idic.finite_element.result import NodalResult, WholeField, refitted
+from modeharvest.idic.finite_element.system import SAMPLES, Body
+from modeharvest.idic.photograph.geometry import Geometry
+from modeharvest.idic.photograph.measure import POINTS_A_CELL, MeasuredPhotograph, found_modes
+from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.photographs.contour import Contour, HoleShape, SeenContours
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic
@@ -35,6 +37,8 @@ from modeharvest.util.masks import large_parts, shrunk
 from modeharvest.util.progress import Progress, silent
 
 _BLUR_PX = 0.7
+_CORRELATED_PX = 2.0 * np.sqrt(np.pi) * _BLUR_PX
+"""Length over which that correlates white noise."""
 _TWO_LEVELS = 0.9
 """Share of a picture's variance that two grey levels explain: 0.98 of plain pictures with noise of
 1 %, 0.67 to 0.81 of speckled ones with a background."""
@@ -50,12 +54,19 @@ _FAINTEST, _ALIKE_GREY = 0.02, 0.3
 """Speckle is what varies by more than a fiftieth of the step at edges, and is alike 2 px away."""
 _DIFFERENCE_PX2 = 1.0 / 3.0
 """Variance of the blur that differences over two pixels add."""
-_CURVED_PX = 2.0
-"""Over which the curvature of contours is averaged."""
+_EVERY_PX, _CURVED_PX, _SHARPENED = 0.5, 5.0, 2
+"""Distance of a contour's points; polynomials through so many px on both sides have its curvature,
+as it is after so many steps."""
+_SHARPEST = 1.0 / 3.0
+"""Largest curvature [1/px]: that of a corner is no radius."""
 _LEAST_PX2 = 60.0
 """Area of a hole or island; smaller ones are dirt."""
 _TURNS_DEG = np.arange(-24.0, 25.0, 6.0)
 """Rotations of the specimen between two pictures that are tried."""
+_CONTOURS = (
+    "No speckle: the displacement is that of a hyperelastic body held to its contours, and the "
+    "ansatz is fitted to it."
+)
 _ALIKE = 0.4
 """Share of the distance to the next hole within which a hole is looked for."""
 
@@ -100,21 +111,12 @@ def plain_surface(image: FloatImage, name: str = "the picture") -> PlainSurface 
         return None
     slope = _slope(grey, contours)
     # White noise of the pixels, blurred: its variance at a point times its correlation length.
-    noise = estimated_noise(image, material).sd ** 2 / (2.0 * np.sqrt(np.pi) * _BLUR_PX)
+    noise = estimated_noise(image, material).sd ** 2 / _CORRELATED_PX
     # The slope of a straight edge says how far the lens, the pixels and this have blurred it.
     blur = float(np.abs(step[material]).mean()) / (slope * np.sqrt(2.0 * np.pi))
     variance = max(0.0, blur**2 - _DIFFERENCE_PX2)
     sharp = tuple(_unbent(points, variance) for points in contours)
     return PlainSurface(material, sharp, noise / slope**2)
-
-
-def require_speckle(image: FloatImage, path: Path) -> None:
-    """InputError if a picture (rows, cols), of this file, shows a plain specimen."""
-    if plain_surface(image, str(path)) is not None:
-        raise InputError(
-            f"expected speckle on the specimen in {path}, got a plain one; measure the "
-            "displacement from its contours, by 'modeharvest measure'"
-        )
 
 
 def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | None:
@@ -186,12 +188,15 @@ def _shows_speckle(image: FloatImage, material: BoolArray, step: FloatArray) -> 
 def _unbent(points: FloatArray, variance: float) -> FloatArray:
     """A contour (n, 2) less what a blur of that variance [px^2] has moved it, 1/2R times that.
 
-    To the centre of curvature, that is; a step back in time of the flow by curvature.
+    To the centre of curvature, that is, of the contour before the blur: found by iteration.
     """
-    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1).mean()
-    smooth = gaussian_filter1d(points, _CURVED_PX / step, axis=0, mode="wrap")
-    bent = np.roll(smooth, -1, axis=0) - 2.0 * smooth + np.roll(smooth, 1, axis=0)
-    return np.asarray(points - 0.5 * variance / step**2 * bent)
+    seen, step = Contour(points).evenly(_EVERY_PX)
+    found, window = seen, 2 * round(_CURVED_PX / step) + 1
+    for _ in range(_SHARPENED):
+        bent = savgol_filter(found, min(window, len(seen)), 5, 2, step, axis=0, mode="wrap")
+        length = np.linalg.norm(bent, axis=1, keepdims=True)
+        found = seen - 0.5 * variance * bent * np.minimum(1.0, _SHARPEST / np.maximum(length, 1e-9))
+    return np.asarray(found)
 
 
 def _slope(grey: FloatImage, contours: Sequence[FloatArray]) -> float:
@@ -254,7 +259,8 @@ def matched_contours(
         affine = _affine(a[at[0]], b[at[1]])
     every = (outer, *found)
     noise = (reference.noise + deformed.noise) * grid.pixel_size**3
-    seen = SeenContours(tuple(c for c, _ in every), tuple(c for _, c in every), noise)
+    sides = tuple(c for c, _ in every), tuple(c for _, c in every)
+    seen = SeenContours(*sides, noise, _CORRELATED_PX * grid.pixel_size)
     return MatchedContours(seen, affine, found, len(holes) - len(found))
 
 
@@ -319,29 +325,31 @@ def displacement_of_plain(
     return found, matched
 
 
-@dataclass(frozen=True)
-class HoleShape:
-    """A hole's shape, by the moments of its contour."""
+def measure_contours(
+    reference: PlainSurface, pair: ImagePair, name: str, geometry: Geometry, cell_size: float,
+    how: PhotographOptions, body: Body, progress: Progress = silent,
+) -> tuple[MeasuredPhotograph, MatchedContours]:  # fmt: skip
+    """Measure a photograph of a specimen without speckle, by its contours, and the modes in it.
 
-    x: float
-    y: float
-    """Its centre [mm]."""
-    area: float
-    """[mm^2]."""
-    ellipticity: float
-    """1 less the ratio of the ellipse's axes that has the same second moments [-]."""
-    orientation_deg: float
-    """Of the longer axis, from x, anticlockwise, -90 to 90 [degrees]."""
-
-    @classmethod
-    def of(cls, contour: Contour) -> HoleShape:
-        """Of a contour [mm]."""
-        area, (x, y), second = contour.moments
-        values, vectors = np.linalg.eigh(second)
-        along = vectors[:, 1] * np.sign(vectors[0, 1] or 1.0)
-        ratio = float(np.sqrt(values[0] / values[1]))
-        angle = float(np.degrees(np.arctan2(along[1], along[0])))
-        return cls(float(x), float(y), abs(area), 1.0 - ratio, angle)
+    The result is the ansatz fitted to the displacement that contours determine, its covariance that
+    by noise; the refitted ansatz' is by all that this displacement is uncertain by, laws and plates
+    included. ``reference``: what the pair's reference shows; ``name``: of the photograph, for
+    messages; for the rest see :func:`~modeharvest.idic.photograph.measure.measure`. InputError if
+    the photograph shows no such specimen, or the spectrum contradicts the cell size.
+    """
+    measured, contours = displacement_of_plain(
+        reference, pair.deformed, geometry.grid, body, progress, name
+    )
+    guess, ansatz, unknowns, text = found_modes(
+        pair, geometry, cell_size, how, measured.at_points(cell_size / POINTS_A_CELL)
+    )
+    assert measured.roots is not None
+    fit = refitted(measured, ansatz, unknowns, geometry.mask)
+    by_noise = replace(measured, roots=measured.roots[..., :SAMPLES])
+    result = refitted(by_noise, fit.ansatz, fit.unknowns, geometry.mask)
+    whole = WholeField(measured, fit, start="an affine motion of the holes")
+    text = (_CONTOURS, *text)
+    return MeasuredPhotograph(result, guess.local, text, whole, measured.warnings), contours
 
 
 def write_holes(path: Path, matched: MatchedContours, unit: str = "mm") -> None:

@@ -1,0 +1,151 @@
+"""What free edges of a body have in common, learnt from a measured displacement.
+
+Nothing pulls at a free edge. In an isotropic elastic body of one material its normal N is then a
+principal direction, and the stretch along N follows from that along the edge, in the same way
+everywhere (R. W. Ogden, Non-Linear Elastic Deformations, 1984). With T along the edge in the
+reference, and n normal to F T,
+
+    F N = l^-c n,    l = |F T|,
+
+where strains are small; c, there nu/(1 - nu) in plane strain and nu in plane stress, is learnt from
+all edges. How far they depart from it, edges that aren't free included, is learnt, too, and is the
+standard deviation with which that is known beside the images. An edge whose departure is neither as
+usual nor an error of what was measured is known less well, by a fifth of its departure at least.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from modeharvest.fem.field import Mesh
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.elements import reference_element, shape_functions, shape_gradients
+
+_GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
+"""Along a side, from 0 to 1."""
+_LEAST_SIDES = 16
+"""To learn from."""
+_LEAST = 1e-3
+"""Departure that elements can't do without, and least stretch [-]."""
+_ROUNDS = 20
+"""Of the fit."""
+_UNUSUAL = 5.0
+"""Standard deviations."""
+_NORMAL = 1.4826
+"""Standard deviation over the median of absolute values."""
+
+
+def on_sides(
+    mesh: Mesh, cells: IntArray, sides: IntArray, at: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points on sides of cells (s,), and gradients of the shape functions there.
+
+    ``at`` (g,): of a side, from 0 to 1. Returns points (s, g, 2) [mm], slopes (s, g, k, 2) [1/mm]
+    and what a side goes along (s, g, 2) [mm].
+    """
+    corners = reference_element(mesh.element).nodes[:3]
+    begin, along = corners[sides], corners[(sides + 1) % 3] - corners[sides]
+    xi, x = begin[:, None] + at[:, None] * along[:, None], mesh.nodes[mesh.cells[cells]]
+    local = shape_gradients(mesh.element, xi)
+    F = np.einsum("ski,sgkj->sgij", x, local)
+    points = np.einsum("sgk,ski->sgi", shape_functions(mesh.element, xi), x)
+    slopes = np.einsum("sgkj,sgji->sgki", local, np.linalg.inv(F))
+    return points, slopes, np.einsum("sgij,sj->sgi", F, along)
+
+
+class FreeEdges:
+    """Edges of a T6 mesh but those beside ``inside``: left, right, bottom and top [mm]."""
+
+    exponent = 0.0
+    """c [-]."""
+    deviation: tuple[float, ...] = ()
+    """Standard deviations of F N along n and along F T from what c says [-]; none of few edges."""
+
+    def __init__(self, mesh: Mesh, inside: tuple[float, float, float, float]) -> None:
+        middle = mesh.cells[:, 3:]
+        cell, side = np.nonzero(np.bincount(middle.ravel())[middle] == 1)
+        points, slopes, along = on_sides(mesh, cell, side, _GAUSS)
+        (x, y), (left, right, bottom, top) = np.moveaxis(points, 2, 0), inside
+        there = ((x > left) & (x < right) & (y > bottom) & (y < top)).all(axis=1)
+        T = (along / np.linalg.norm(along, axis=-1, keepdims=True))[there]
+        self.frame = np.stack([T, T[..., ::-1] * [1.0, -1.0]])
+        """(2, s, g, 2) T and N at points of each side."""
+        self.slopes = np.einsum("sgki,fsgi->fsgk", slopes[there], self.frame)
+        """(2, s, g, k) of the shape functions along T and N [1/mm]."""
+        self.nodes, self.size = mesh.cells[cell[there]], 2 * len(mesh.nodes)
+        self._dofs = (2 * self.nodes[:, :, None] + np.arange(2)).reshape(-1, 12)
+
+    def _turned(self, u: FloatArray) -> tuple[FloatArray, ...]:
+        """(s, g) l; (s, g, 2) FT/l and n; (s, g) FN along n and along FT."""
+        FT, FN = self.frame + np.einsum("fsgk,ski->fsgi", self.slopes, u.reshape(-1, 2)[self.nodes])
+        length = np.maximum(np.linalg.norm(FT, axis=-1), _LEAST)
+        t = FT / length[..., None]
+        n = t[..., ::-1] * [1.0, -1.0]
+        return length, t, n, (FN * n).sum(axis=-1), (FN * t).sum(axis=-1)
+
+    def learn(self, u: FloatArray, uncertain: FloatArray) -> None:
+        """Learn c, and how far u (2 n,) [mm] departs from what it says.
+
+        ``uncertain`` (2 n, k): vectors whose outer products sum up to the covariance of u [mm^2].
+        """
+        if len(self.nodes) < _LEAST_SIDES:
+            return
+        length, _, _, normal, _ = self._turned(u)
+        x, y = np.log(length), np.log(np.maximum(normal, _LEAST))
+        weight, errors = np.ones_like(x), uncertain[self._dofs]
+        for _ in range(_ROUNDS):
+            self.exponent = -float((weight * x * y).sum() / max((weight * x**2).sum(), _LEAST**2))
+            slopes, off = self._departures(u)
+            variance = (np.einsum("fsgd,sdk->fsgk", slopes, errors, optimize=True) ** 2).sum(axis=3)
+            spread = _NORMAL * np.median(np.abs(off).reshape(2, -1), axis=1)[:, None, None]
+            usual = np.maximum(spread, _LEAST) ** 2
+            square = usual + variance.mean(axis=2, keepdims=True)
+            unusual = off**2 / square / _UNUSUAL**2
+            weight = (1.0 + unusual[0]) ** -2 / square[0]
+        self.deviation = tuple(map(float, np.sqrt(usual.ravel())))
+        known = np.median(variance.reshape(2, -1), axis=1)[:, None, None]
+        self._beyond = np.sqrt(np.maximum(1.0 - known / usual, 0.0))
+        # The two points of a side know the same.
+        self._root = np.sqrt(0.5 / usual / (1.0 + unusual.mean(axis=2, keepdims=True)))
+
+    def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
+        """(2 n, 2 n) and (2 n,): sums of dd' and -dr of departures r of u, over their variance."""
+        slopes, off = self._weighed(u)
+        rows, cols = np.repeat(self._dofs, 12, axis=1).ravel(), np.tile(self._dofs, 12).ravel()
+        blocks = slopes.swapaxes(1, 2) @ slopes
+        matrix = csr_array((blocks.ravel(), (rows, cols)), shape=(self.size, self.size))
+        return matrix, -self._sums(slopes, off[..., None])[:, 0]
+
+    def samples(self, u: FloatArray, count: int) -> FloatArray:
+        """(2 n, count) random vectors of what departures beyond errors of the learnt one do."""
+        slopes, _ = self._weighed(u)
+        z = np.random.default_rng(2).standard_normal((len(slopes), 2, 2, count))
+        return self._sums(slopes, (self._beyond * z).reshape(-1, 4, count))
+
+    def _weighed(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(s, 4, 12) derivatives of departures by u, and (s, 4) these, over their deviation."""
+        slopes, off = self._departures(u)
+        slopes, off = self._root[..., None] * slopes, self._root * off
+        return np.moveaxis(slopes, 0, 1).reshape(-1, 4, 12), np.moveaxis(off, 0, 1).reshape(-1, 4)
+
+    def _departures(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(2, s, g, 12) derivatives of departures by u [1/mm], and (2, s, g) these [-]."""
+        length, t, n, normal, shear = self._turned(u)
+        c, (along, across) = self.exponent, self.slopes[..., None]
+        per, t, n = 1.0 / length[..., None, None], t[:, :, None], n[:, :, None]
+        turn = along * n * per  # of both, by u
+        of_stretch = (c * length ** (-c - 1.0))[..., None, None] * along * t
+        d_normal = across * n - shear[..., None, None] * turn + of_stretch
+        d_shear = across * t + normal[..., None, None] * turn
+        slopes = np.stack([d_normal, d_shear])
+        return slopes.reshape(*slopes.shape[:3], -1), np.stack([normal - length**-c, shear])
+
+    def _sums(self, slopes: FloatArray, values: FloatArray) -> FloatArray:
+        """(2 n, c) sums over all sides of their derivatives times values (s, 2 g, c)."""
+        parts = slopes.swapaxes(1, 2) @ values
+        ones = csr_array(
+            (np.ones(self._dofs.size), (self._dofs.ravel(), np.arange(self._dofs.size))),
+            shape=(self.size, self._dofs.size),
+        )
+        return np.asarray(ones @ parts.reshape(self._dofs.size, -1))

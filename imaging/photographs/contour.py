@@ -1,0 +1,105 @@
+"""Contours in photographs: smooth closed curves, the distance of points from them, their shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from modeharvest.util.arrays import FloatArray
+
+_FINE_PX = 0.25
+"""Between the points of a contour among which the nearest is sought."""
+
+
+class Contour:
+    """A closed smooth curve through points (n, 2) [mm], each once."""
+
+    def __init__(self, points: FloatArray) -> None:
+        closed = np.vstack([points, points[:1]])
+        length = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+        keep = np.append(length > 1e-3 * np.median(length), True)
+        closed, s = closed[keep], np.concatenate([[0.0], np.cumsum(length[keep[:-1]])])
+        self.points, self.length = np.asarray(closed[:-1], np.float64), float(s[-1])
+        closed[-1] = closed[0]
+        self._curve = CubicSpline(s, closed, bc_type="periodic")
+
+    @cached_property
+    def _fine(self) -> tuple[FloatArray, cKDTree]:
+        step = _FINE_PX * self.length / len(self.points)
+        s = np.linspace(0.0, self.length, int(self.length / step), endpoint=False)
+        return np.asarray(s, dtype=np.float64), cKDTree(self._curve(s))
+
+    @cached_property
+    def moments(self) -> tuple[float, FloatArray, FloatArray]:
+        """Signed area [mm^2], centroid (2,) [mm], second central moments (2, 2) over it [mm^2]."""
+        p, q = self.points, np.roll(self.points, -1, axis=0)
+        cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+        area = 0.5 * float(cross.sum())
+        centre = (p + q).T @ cross / (6.0 * area)
+        a, b = p - centre, q - centre
+        around = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        pairs = np.einsum("ni,nj->nij", a + b, a + b) + np.einsum("ni,nj->nij", a, a)
+        second = np.einsum("nij,n->ij", pairs + np.einsum("ni,nj->nij", b, b), around)
+        return area, np.asarray(centre, np.float64), np.asarray(second / (24.0 * area))
+
+    def evenly(self, step: float) -> tuple[FloatArray, float]:
+        """Points (n, 2) about so far apart along the curve, at least 16, and their distance."""
+        count = max(16, round(self.length / step))
+        return self._curve(np.arange(count) * self.length / count), self.length / count
+
+    def distance(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) signed distance of points (n, 2) from the curve [mm], and (n, 2) its gradient."""
+        fine, tree = self._fine
+        s, step = fine[tree.query(x)[1]], self.length / len(self.points)
+        for _ in range(3):
+            off, along, bent = self._curve(s) - x, self._curve(s, 1), self._curve(s, 2)
+            square = (along**2).sum(axis=1)
+            slope = square + (off * bent).sum(axis=1)
+            slope = np.where(slope > 0.2 * square, slope, square)
+            s = np.mod(s - np.clip((off * along).sum(axis=1) / slope, -step, step), self.length)
+        along = self._curve(s, 1)
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return ((x - self._curve(s)) * normal).sum(axis=1), normal
+
+
+@dataclass(frozen=True, eq=False)
+class SeenContours:
+    """Contours of one and the same edges in two images."""
+
+    reference: tuple[Contour, ...]
+    deformed: tuple[Contour, ...]
+    """One after the other, gone along in the same sense [mm]."""
+    noise: float
+    """Variance of their distance times the length over which it is correlated [mm^3]."""
+    correlated: float
+    """That length [mm]."""
+
+
+@dataclass(frozen=True)
+class HoleShape:
+    """A hole's shape, by the moments of its contour."""
+
+    x: float
+    y: float
+    """Its centre [mm]."""
+    area: float
+    """[mm^2]."""
+    ellipticity: float
+    """1 less the ratio of the ellipse's axes that has the same second moments [-]."""
+    orientation_deg: float
+    """Of the longer axis, from x, anticlockwise, -90 to 90 [degrees]."""
+
+    @classmethod
+    def of(cls, contour: Contour) -> HoleShape:
+        """Of a contour [mm]."""
+        area, (x, y), second = contour.moments
+        values, vectors = np.linalg.eigh(second)
+        along = vectors[:, 1] * np.sign(vectors[0, 1] or 1.0)
+        ratio = float(np.sqrt(values[0] / values[1]))
+        angle = float(np.degrees(np.arctan2(along[1], along[0])))
+        return cls(float(x), float(y), abs(area), 1.0 - ratio, angle)
