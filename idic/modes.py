@@ -174,15 +174,15 @@ def turning_family(vectors: FloatArray, cell_size: float, junction: ArrayLike) -
 
 T2 = -0.45
 """Second over first amplitude of a triangular lattice's modes [-]; -0.42 to -0.46 were found for
-d/l = 0.87 and 0.92 and five loadings (docs/families.md)."""
+d/l = 0.87 and 0.92 and five loadings (docs/explanation/families.md)."""
 
 
 def zone_boundary_families(specimen: Specimen) -> tuple[ModeFamily, ...]:
     """Families of the modes at the three M points of a specimen's lattice of staggered rows.
 
     Each has a wave towards its M point, of mostly transverse motion, and one across, the shortest
-    that the lattice couples to it; both are zero at the holes' centres (docs/families.md). For a
-    transverse amplitude of 1 of the first wave the parameters are L1, its longitudinal amplitude,
+    that the lattice couples to it; both are zero at holes' centres (docs/explanation/families.md).
+    For a transverse amplitude of 1 of the first wave the parameters are L1, its longitudinal one,
     T2, the second one's transverse one, the first one's wave vector, which the second one's turns
     and grows with, and the phases.
     """

@@ -58,7 +58,7 @@ def test_every_key_is_there_and_no_other(table: str) -> None:
 
 
 def test_the_user_s_guide_tells_of_every_key() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "harvest.md").read_text("utf-8")
+    page = (Path(__file__).parents[1] / "docs/how-to/harvest.md").read_text("utf-8")
     rows = "".join(line for line in page.splitlines() if line.startswith("|"))
     for kind in tables().values():
         for field in fields(kind):

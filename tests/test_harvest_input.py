@@ -16,12 +16,13 @@ from modeharvest.cli.root import main
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import square_family
+from modeharvest.idic.photograph.geometry import SpecimenTable, find_geometry
 from modeharvest.idic.solver.noise import measured_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs import prepare
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
-from modeharvest.util.errors import WriteError
+from modeharvest.util.errors import InputError, WriteError
 
 PITCH, PIXEL = 1.9, 0.035
 CELLULAR, DOMAIN = Box.centred(3 * PITCH, 4 * PITCH), Box.centred(3 * PITCH + 1.6, 4 * PITCH + 1.6)
@@ -226,3 +227,24 @@ def test_repeats_between_which_something_moved_are_reported() -> None:
     assert "if anything moved" not in still.source
     assert moved.sd > 2 * still.sd
     assert "if anything moved" in moved.source
+
+
+@pytest.mark.parametrize(
+    ("radii", "words"),
+    [((), "with no holes where 2 x 2 are needed"), ((20,), "with 1 hole where 2 x 2 are needed"),
+     (None, "with no holes;")],
+)  # fmt: skip
+def test_a_plain_body_is_named_with_what_measures_it(
+    radii: tuple[int, ...] | None, words: str
+) -> None:
+    row, col = np.mgrid[:200, :300]
+    mask = np.ones((200, 300), dtype=bool)
+    if radii is not None:
+        mask = (abs(row - 100) < 80) & (abs(col - 150) < 120)
+        for radius in radii:
+            mask &= np.hypot(row - 100, col - 150) > radius
+    with pytest.raises(InputError) as caught:
+        find_geometry(mask, PixelGrid.centred(200, 300, 0.02), SpecimenTable(1.0), Path())
+    size = "6 x 4 mm" if radii is None else "4.78 x 3.18 mm"
+    assert f"got a body of {size} {words}" in str(caught.value)
+    assert "'modeharvest measure REFERENCE DEFORMED... --pixel-size 0.02'" in str(caught.value)

@@ -24,7 +24,7 @@ from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.runs.case import shipped_solution
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
-from modeharvest.runs.photographs.prepare import named_files
+from modeharvest.runs.photographs.sequence import named_files
 from modeharvest.util.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import synthetic_harvest as made_up
 from documented_keys import undocumented
+from explored import content_of, quantity, samples
 from html_page import Page
 from matplotlib.path import Path
 
@@ -93,9 +94,24 @@ def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
     assert all(source.startswith("data:") for source in page.sources)
     outside = {link for link in page.links if not link.startswith("#")}
     assert all(link.startswith("https://doi.org/") for link in outside)
-    assert not {"script", "link", "iframe", "object"} & set(page.tags)
-    assert not re.search(r"@import|url\((?!#)", text)
+    assert not {"link", "iframe", "object"} & set(page.tags)
+    assert not re.search(r"@import|url\((?!#)|<script[^>]*\bsrc|\bfetch\(|XMLHttpRequest", text)
+    assert "default-src 'none'" in text  # so the browser loads nothing, whatever a script asks
     assert len(text.encode()) < 8e6
+
+
+def test_its_fields_can_be_explored(text: str, harvest: Harvest) -> None:
+    content = content_of(text)
+    keys = {q["key"] for q in content["quantities"]}
+    assert {"ux", "uy", "v0x", "v1", "fluc1x", "residual"} <= keys
+    assert [s["name"] for s in content["states"]] == [s.name for s in states(harvest)]
+    for k, state in enumerate(states(harvest)):
+        u = samples(content, np.where(harvest.mask, state.result.displacement()[..., 0], np.nan))
+        found = quantity(content, k, "ux")
+        assert np.array_equal(np.isnan(found), np.isnan(u))
+        assert (
+            np.nanmax(np.abs(found - u)) <= np.nanmax(np.abs(u)) / 30_000 + 1e-3 * content["pixel"]
+        )
 
 
 def test_every_panel_is_there_for_every_photograph(harvest: Harvest, text: str) -> None:

@@ -53,19 +53,21 @@ class Buckling:
 def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
     """Mean nominal compression along x and y of a part of the specimen [-].
 
-    The shortening between its opposite edges by v0, averaged along them, over their distance.
+    The shortening of the distance between the means of opposite edges, moved by v0, over that
+    distance: a rotation is no strain.
     """
     along = np.linspace(0.02, 0.98, 33)
     x_sides = np.array([cellular.x_min, cellular.x_max])
     y_sides = np.array([cellular.y_min, cellular.y_max])
     x, y = (sides[0] + along * np.ptp(sides) for sides in (x_sides, y_sides))
-    ansatz, a = result.ansatz, result.unknowns
-    across_x = ansatz.v0(a, x_sides, y)[..., 0].mean(axis=0)
-    across_y = ansatz.v0(a, x, y_sides)[..., 1].mean(axis=1)
-    return (
-        float((across_x[0] - across_x[1]) / np.ptp(x_sides)),
-        float((across_y[0] - across_y[1]) / np.ptp(y_sides)),
+    v0, a = result.ansatz.v0, result.unknowns
+    moved = (v0(a, x_sides, y).mean(axis=0), v0(a, x, y_sides).mean(axis=1))
+    apart = np.diag([np.ptp(x_sides), np.ptp(y_sides)])
+    (along_x, along_y) = (
+        1.0 - np.linalg.norm(edge + u[1] - u[0]) / edge.sum()
+        for edge, u in zip(apart, moved, strict=True)
     )
+    return float(along_x), float(along_y)
 
 
 def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.local.formats import recognised
 from modeharvest.idic.local.tables import ROLES, Column, Table, choose, read_table
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
@@ -39,6 +40,8 @@ class LocalField:
     sd: FloatArray | None = None
     """(n, 2) standard deviations of u [mm]; None if not known."""
     source: str = ""
+    convention: str = ""
+    """What its file was recognised as, in one sentence; empty if that was declared."""
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "u", "sd"):
@@ -66,6 +69,11 @@ class LocalField:
     @property
     def _named(self) -> str:
         return f" {self.source}" if self.source else ""
+
+    @property
+    def read_as(self) -> str:
+        """What its file was taken for, as a sentence."""
+        return f"{self.source} was read as {self.convention or 'its columns or options say'}."
 
     @property
     def points(self) -> FloatArray:
@@ -127,8 +135,9 @@ class LocalField:
             )
         sd = None if self.sd is None else self.sd[keep]
         return LocalField(
-            self.x[keep], self.y[keep], self.u[keep], self.good[keep], sd, self.source
-        )
+            self.x[keep], self.y[keep], self.u[keep], self.good[keep], sd, self.source,
+            self.convention,
+        )  # fmt: skip
 
     def less(self, displacement: Callable[[FloatArray], FloatArray]) -> LocalField:
         """The microfluctuation field w = u − model, with the field's own standard deviations.
@@ -180,11 +189,14 @@ def read_field(
     units: str | None = None,
     displacement_units: str | None = None,
     y_axis: str | None = None,
-    first_pixel: int = 0,
+    first_pixel: int | None = None,
     columns: Mapping[str, str | int] | None = None,
+    frame: int | None = None,
 ) -> LocalField:
     """Read a displacement field of any DIC code.
 
+    Files of Ncorr, VIC, DaVis, DICe, MatchID, GOM/ZEISS, pyvale and modeharvest are recognised and
+    need no options; what is given counts more than what their code does, see ``formats``.
     The file's points that are NaN, have ``valid`` zero or a negative ``sigma`` (as VIC and DICe
     mark failure) are kept as not valid. ``sigma`` in pixels is taken for the standard deviation of
     both components. InputError if a column, the units or the axis are not known, or if shapes
@@ -197,16 +209,22 @@ def read_field(
     displacement_units : Of u and v, if they are not those of x and y.
     y_axis : "up" or "down": where y grows and v is positive; None: as the columns' names state. In
         pixels, "up" counts from the lowest row.
-    first_pixel : What the code calls the first pixel's centre, 0 or (as MATLAB) 1.
+    first_pixel : What the code calls the first pixel's centre, 0 or (as MATLAB) 1; None: 0, or as
+        the code that is recognised does.
     columns : Names, or numbers from 1, of columns for "x", "y", "u", "v", "sd_u", "sd_v", "sigma"
         and "valid", where they can't be known by themselves.
+    frame : Number from 1 of the field in a file of several, as of Ncorr.
     """
-    table = read_table(path)
+    found = (read_table(path), None) if columns else recognised(Path(path), units, y_axis, frame)
+    table, known = found
+    if known is not None:
+        units, y_axis = units or known.units, y_axis or known.y_axis
+        displacement_units = displacement_units or known.displacement_units
+    first_pixel = first_pixel or 0
     chosen = choose(list(table), columns or {}, units, str(path))
     positions, motions = [chosen["x"], chosen["y"]], [chosen["u"], chosen["v"]]
     position = _declared("units", _UNITS, positions, units, str(path))
-    same = units or ("px" if chosen["x"].of_image_code else None)
-    motion = _declared("units", _UNITS, motions, displacement_units or same, str(path))
+    motion = _declared("units", _UNITS, motions, displacement_units or units, str(path))
     up_or_down = _declared("y_axis", _AXES, [*positions, chosen["v"]], y_axis, str(path))
     down = up_or_down == "down"
     if "px" in (position, motion) and grid is None:
@@ -221,7 +239,8 @@ def read_field(
     scale = grid.pixel_size if motion == "px" and grid is not None else 1.0
     sd, ok = _quality(table, chosen, x.size, scale, motion == "px", str(path))
     u = scale * np.column_stack([u, sign * v])
-    return LocalField(x, y, u, ok, sd, source=Path(path).name)
+    text = "" if known is None else str(known)
+    return LocalField(x, y, u, ok, sd, source=Path(path).name, convention=text)
 
 
 def write_field(path: Path | str, field: LocalField) -> None:
@@ -295,4 +314,5 @@ def _quality(
         sd = scale * np.column_stack([values["sd_u"], values["sd_v"]])
     elif "sigma" in values and in_px:
         sd = scale * np.column_stack([values["sigma"]] * 2)
-    return (None if sd is None or not np.isfinite(sd[ok]).any() else sd), ok
+    is_known = sd is not None and bool(np.any(np.nan_to_num(sd[ok])))  # 0 is written for none
+    return (sd if is_known else None), ok

@@ -86,7 +86,7 @@ WHERE = "MODEHARVEST_PYVALE"
 """Environment variable: the Python that has pyvale, if it isn't this one."""
 HOW_TO_GET = (
     f"pyvale is not installed; give it an environment of its own and set {WHERE} to the Python "
-    "there (see docs/fields.md), or read the field of another code"
+    "there (see docs/how-to/fields.md), or read the field of another code"
 )
 _TRIES = 3
 """Seeds that are tried."""

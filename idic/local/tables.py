@@ -1,14 +1,10 @@
-"""Named columns of CSV, NPZ, HDF5, MAT and VTK files, and the meaning of the names of DIC codes.
-
-Known: x, y, u, v with or without a unit, the lower and upper case of VIC-2D and VIC-3D (pixels and
-millimetres), DICe's COORDINATE_X and DISPLACEMENT_X, pyvale's subset_x and disp_u, GOM's and
-ZEISS's dx or displacement x.
-"""
+"""Named columns of CSV, NPZ, HDF5, MAT and VTK files, and the meaning of the names of DIC codes."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -35,6 +31,7 @@ _BYTES_OF_TEXT = 10.0
 """Most that a character of a table of numbers becomes in memory."""
 _HEAD = 1000
 """Lines of a text among which the first line of numbers is looked for."""
+_BENCHMARK = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 _LOGICAL = {"true": 1.0, "false": 0.0}
 
 
@@ -181,18 +178,40 @@ def read_mat(path: Path) -> dict[str, NDArray[Any]]:
     return read_in_child("mat", path, "a MAT file", _REMEDY)
 
 
+def claimed_benchmark(path: Path) -> str | None:
+    """The id that a file itself says it belongs to; None if it says none or can't be read."""
+    suffix, text = path.suffix.lower(), ""
+    with suppress(InputError), reading(path, _WHAT):  # who reads the field says what is wrong
+        if suffix in TEXTS:
+            with path.open(encoding="utf-8", errors="replace") as file:
+                text = "".join(line for line in islice(file, 50) if line[0] in "#%")
+        elif suffix == ".npz":
+            with path.open("rb") as stream:
+                text = f"benchmark {np.load(stream, allow_pickle=False)['benchmark']}"
+        elif h5py.is_hdf5(path):
+            with open_hdf5(path, _WHAT) as file:
+                text = f"benchmark {file.attrs['benchmark']}"
+        elif suffix == ".mat":
+            text = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
+    found = _BENCHMARK.search(text)
+    return found.group(1).lower() if found else None
+
+
 def _read_vtk(path: Path) -> Table:
-    """Positions x and y, and a vector at them as u and v."""
+    """Positions x and y, and a vector at them as u and v, in mm and up if its name ends in _mm."""
     mesh = read_any_mesh(path)
     vectors = {n: v for n, v in mesh.point_data.items() if v.ndim == 2 and v.shape[1] in (2, 3)}
-    named = [name for name in vectors if name.lower() in _VECTORS] or list(vectors)
+    named = [n for n in vectors if n.lower().removesuffix("_mm") in _VECTORS] or list(vectors)
     if len(named) != 1:
         raise InputError(
             f"{path}: expected one vector at the points, named u or displacement, got "
             f"{', '.join(map(repr, mesh.point_data)) or 'none'}"
         )
     (x, y), (u, v) = mesh.points[:, :2].T, vectors[named[0]][:, :2].T
-    return _numeric({"x": x, "y": y, "u": u, "v": v})
+    heads = ("x", "y", "u", "v")
+    if named[0].endswith("_mm"):
+        heads = ("x [mm]", "y up [mm]", "u [mm]", "v up [mm]")
+    return _numeric(dict(zip(heads, (x, y, u, v), strict=True)))
 
 
 def _by_last_name(found: dict[str, Any]) -> dict[str, Any]:
@@ -250,8 +269,6 @@ class Column:
     """Stated by the name, "px" or "mm"; else None."""
     y_axis: str | None
     """Stated by the name, "up" or "down"; else None."""
-    of_image_code: bool = False
-    """Whether only codes that measure everything in pixels use this name."""
 
 
 def column(name: str) -> Column:
@@ -263,7 +280,7 @@ def column(name: str) -> Column:
     base = " ".join(p for p in parts if p not in _UNITS and p not in ("up", "down"))
     role = _role(base)
     if _as_x(base) in _IMAGE_CODES and unit is None:
-        return Column(name, role, "px", "down", of_image_code=True)
+        return Column(name, role, "px", "down")
     return Column(name, role, unit, y_axis)
 
 
@@ -324,15 +341,12 @@ def choose(
 
 
 def _narrowed(candidates: list[Column], units: str | None) -> list[Column]:
-    """Drop what is in another unit; VIC writes pixels in lower and millimetres in upper case."""
+    """Drop what is in another unit."""
     if len(candidates) == 1 or units is None:
         return candidates
     fitting = [c for c in candidates if c.unit in (units, None)] or candidates
     named = [c for c in fitting if c.unit == units]
-    if len(named) == 1:
-        return named
-    cased = [c for c in fitting if c.name[:1].isupper() == (units == "mm")]
-    return cased if len(cased) == 1 else fitting
+    return named if len(named) == 1 else fitting
 
 
 def _listed(names: list[str]) -> str:

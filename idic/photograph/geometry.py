@@ -279,9 +279,9 @@ def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: 
     lattice: HoleLattice | None = None
     try:
         lattice = find_hole_lattice(mask, table.cell_size / grid.pixel_size)
-    except InputError:
+    except InputError as error:
         if not (table.polygon or table.cells or table.regions):
-            raise
+            raise _no_pattern(mask, grid, error) from error
     given = {
         r.name: _polygon(r.polygon, mask, grid, f"specimen.regions {r.name!r}").cellular
         for r in table.regions
@@ -289,6 +289,19 @@ def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: 
     _require_apart(given, table.cell_size)
     region = _cellular(table, lattice, mask, grid, base)
     return Geometry(grid, mask, lattice, region, given or {"": region.cellular})
+
+
+def _no_pattern(mask: BoolArray, grid: PixelGrid, error: InputError) -> InputError:
+    """What is seen of a body without a lattice of holes, and what measures it; or another error."""
+    if "no lattice" not in str(error) and not mask.all():
+        return error
+    height, width = (mask.any(axis=k).sum() * grid.pixel_size for k in (1, 0))
+    why = "no holes" if mask.all() else str(error).rpartition("in it: ")[2].partition(";")[0]
+    return InputError(
+        f"expected a lattice of holes, got a body of {width:.3g} x {height:.3g} mm with {why}; its "
+        "displacement is measured by 'modeharvest measure REFERENCE DEFORMED... --pixel-size "
+        f"{grid.pixel_size:g}', or draw the cellular part (specimen.polygon)"
+    )
 
 
 def _cellular(

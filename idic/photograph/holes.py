@@ -226,22 +226,19 @@ def find_hole_lattice(mask: ArrayLike, cell_px: float | None = None) -> HoleLatt
 def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
     """Find the lattice of given holes; see :func:`find_hole_lattice`."""
     if len(holes) < 4:
-        raise InputError(
-            f"expected holes on a lattice, at least 2 x 2, got a mask with {len(holes)} "
-            f"{'hole' if len(holes) == 1 else 'holes'} ({holes.at_border} openings at the image's "
-            "border don't count): a mask with no lattice in it; give the cellular region instead"
-        )
+        cut = f" ({cut} openings at the border don't count)" if (cut := holes.at_border) > 1 else ""
+        raise _no_lattice(len(holes), f"where 2 x 2 are needed{cut}")
     spots = holes.centres * _FLIP
     vectors = spanning_vectors(spots)
     if vectors is None:
-        raise _no_lattice(len(holes), "they lie in one row")
+        raise _no_lattice(len(holes), "in one row")
     index, known = _counted(spots, vectors)
     if known.mean() < _MOST or known.sum() < 4 or np.ptp(index[known], axis=0).min() == 0:
-        raise _no_lattice(len(holes), f"only {known.sum()} are a lattice vector from a neighbour")
+        raise _no_lattice(len(holes), f"of which {known.sum()} are a lattice vector apart")
     origin, vectors, misfit = _straight(spots[known], index[known])
     pitch = float(np.linalg.norm(vectors, axis=1).mean())
     if misfit > _BENT * pitch:
-        raise _no_lattice(len(holes), f"they are {misfit:.0f} px off one of {pitch:.0f} px")
+        raise _no_lattice(len(holes), f"up to {misfit:.0f} px off one of {pitch:.0f} px")
     found = HoleLattice(
         centres=holes.centres[known],
         index=index[known],
@@ -329,6 +326,6 @@ def _kind(vectors: FloatArray) -> Kind:
 
 def _no_lattice(holes: int, why: str) -> InputError:
     return InputError(
-        f"expected holes on a lattice, got a mask with no lattice in it: of {holes} holes {why}; "
-        "check the mask, or give the cellular region"
+        "expected holes on a lattice, got a mask with no lattice in it: "
+        f"{holes or 'no'} hole{'s' * (holes != 1)} {why}; check it, or draw the cellular part"
     )

@@ -100,6 +100,7 @@ def initial_guess(
     else:
         share = 100 * local.valid_share
         text = [f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid."]
+        text += [local.read_as] * bool(local.convention)
     patterns = tuple(read_pattern(measured_spectrum(local, cell_size, box)) for box in boxes)
     modes: list[tuple[ModeFamily, Box]] = []
     for box, pattern in zip(boxes, patterns, strict=True):

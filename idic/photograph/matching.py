@@ -10,6 +10,7 @@ the reference, or the motion is larger than expected.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from modeharvest.idic.local.motion import Slow
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.masks import room_around
@@ -89,6 +91,48 @@ def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[Hol
         return -len(motion), float(np.linalg.norm(shift))
 
     return tuple(sorted(motions, key=rank))
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """A turn and a shift of the whole specimen: x goes to turn (x - before) + after."""
+
+    angle_deg: float
+    """Counter-clockwise as the photograph is seen [degrees]."""
+    before: tuple[float, float]
+    after: tuple[float, float]
+    """A point of the specimen in the reference and in the deformed image, (row, col) [px]."""
+
+    def undone(self, image: FloatImage, mask: BoolArray) -> tuple[FloatImage, BoolArray]:
+        """A deformed image (rows, cols) as if it hadn't happened, and the mask of its material.
+
+        By a quintic spline. What comes from beyond the image is no material, and as grey as what
+        else is none.
+        """
+        grid = np.indices(image.shape, np.float64) - np.reshape(self.before, (2, 1, 1))
+        c, s = math.cos(math.radians(self.angle_deg)), math.sin(math.radians(self.angle_deg))
+        row, col = (c * grid[0] - s * grid[1] + self.after[0],
+                    s * grid[0] + c * grid[1] + self.after[1])  # fmt: skip
+        shown = SplineImage.of(image, 5).sample(row, col)[0].astype(np.float32)
+        material = map_coordinates(mask.astype(np.float32), (row, col), order=1) > 0.5
+        beyond = ~np.isfinite(shown)
+        shown[beyond] = np.median(image if mask.all() else image[~mask])
+        return shown, material & ~beyond
+
+
+def rigid_motion(reference: HoleLattice, deformed: HoleLattice) -> RigidMotion:
+    """How the holes have turned and moved as a whole; strain and pattern are no part of it.
+
+    By the least squares of G. Wahba's problem, the holes matched as is likeliest: by less than some
+    25 degrees, and up to whole cells. Raises InputError if these are not the same specimen's.
+    """
+    motion = possible_motions(reference, deformed)[0]
+    before, after = motion.before.mean(axis=0), motion.after.mean(axis=0)
+    pairs = (motion.before - before).T @ (motion.after - after)
+    # Rows go down: counter-clockwise is from +col to -row.
+    angle = math.atan2(pairs[0, 1] - pairs[1, 0], pairs[0, 0] + pairs[1, 1])
+    first, second = ((float(row), float(col)) for row, col in (before, after))
+    return RigidMotion(math.degrees(angle), first, second)
 
 
 def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:

@@ -11,10 +11,12 @@ from typing import Any
 from markupsafe import Markup
 
 from modeharvest.report.experiment import expected_cards, outcome_text
+from modeharvest.report.explore import explored_photographs
 from modeharvest.report.figures import fits
 from modeharvest.report.figures import photographs as figures
 from modeharvest.report.figures.curves import draw_onset, draw_waves
 from modeharvest.report.figures.photographs import PhotographState
+from modeharvest.report.figures.sequence import force_cards
 from modeharvest.report.figures.whole_field import whole_cards, whole_panel_numbers
 from modeharvest.report.model import (
     Card,
@@ -91,6 +93,8 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         case=summary["experiment"],
         versions=summary["versions"],
         hero=ReportFigure("hero", "The last photograph", partial(figures.draw_hero, states[-1]))
+        if states else None,
+        explore=partial(explored_photographs, states, figures.truth_of, figures.residual_of)
         if states else None,
         hero_caption=text_of("photographs-hero", name=last["name"], state=state),
         **caption("page-photographs"),
@@ -210,6 +214,9 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
     def has_local(state: PhotographState) -> bool:
         return state.frame.w is not None and state.frame.whole is None  # drawn above
 
+    def has_residual(state: PhotographState) -> bool:
+        return not state.frame.by_contours
+
     def is_known(state: PhotographState) -> bool:
         return figures.truth_of(state) is not None
 
@@ -224,7 +231,8 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
           for k, part in enumerate(parts) for c, axis in enumerate("xy")),
         *fits.ansatz_panels("found", "real", modes),
         *figures.WHOLE_MAPS.panels(),
-        Panel(last, "residual", figures.draw_residual, text="photograph-residual", exact=True),
+        Panel(last, "residual", figures.draw_residual, has_residual, "photograph-residual",
+              exact=True),
         Panel(last, "w", figures.draw_w, has_local, "photograph-w"),
         *(Panel("uncertainty", f"{name}{'' if name == 'v0' else i + 1}-{cause}",
                 partial(figures.draw_error, name=name, i=i, cause=cause),
@@ -309,6 +317,7 @@ def _timeline(harvest: Harvest, summary: Summary) -> Section:
     if harvest.timeline:
         drawn = partial(draw_onset, harvest.timeline, harvest.buckling)
         cards.append(Card.captioned("timeline-pattern", drawn))
+    cards += force_cards(summary["frames"], "strain", "nominal strain")
     frames = [frame for frame in summary["frames"] if frame["modes"]]
     if len(frames) > 1:
         cards.append(Card.captioned("timeline-waves", partial(draw_waves, frames)))
@@ -412,12 +421,14 @@ def notes(summary: Summary) -> list[str]:
         if frame["outcome"] != "converged":
             text.append(f"{at} {outcome_text(frame)}")
         text += [f"{at} {frame['residual_test']}", f"{at} {_capitalised(frame['weighting'])}"]
-    noise = summary["noise"]
+    noise, by = summary["noise"], "photographs"
+    if summary["frames"][-1]["shown"] == "contours":
+        by = "contours"
     share = "" if noise["of_full_scale"] is None else (
         f", {100 * noise['of_full_scale']:.2g} % of full scale")  # fmt: skip
     text += [
         f"Camera noise: {noise['sd']:.3g} grey levels{share}, {noise['source']}.",
-        *map(text_of, ("photographs-errors", "photographs-w", "photographs-rms")),
+        *map(text_of, (f"{by}-errors", "photographs-w", "photographs-rms")),
     ]
     return text
 

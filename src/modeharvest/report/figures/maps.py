@@ -57,7 +57,7 @@ class MapFrame:
         mean = block_means(np.where(known, field, 0.0), self.factor)
         return np.divide(mean, share, out=np.full_like(mean, np.nan), where=share > 0)
 
-    def sample(self, field: FloatArray) -> FloatArray:
+    def sample(self, field: NDArray[Any]) -> NDArray[Any]:
         """Take the middle pixel of each cell from a field (rows, cols) of the images."""
         return field[np.ix_(*self.pixels)]
 
@@ -166,7 +166,7 @@ def draw_field(
 
     ``values``: (rows, cols) on ``map_frame.grid``; NaN is left blank. ``unit``: of lengths.
     """
-    drawn, axes = _empty_map(map_frame, unit=unit)
+    drawn, axes = empty_map(map_frame, unit=unit)
     _draw_cells(axes, map_frame, scale.of(values), motion)
     colour_bar(axes, scale)
     return drawn
@@ -187,16 +187,16 @@ def draw_image(
     displacement at the mesh's nodes [mm], for the boundary. ``scale``: what the levels mean;
     fractions of full scale by default.
     """
-    drawn, axes = _empty_map(map_frame)
-    _show_grey(axes, map_frame, image, material, grid)
-    _draw_edge(axes, map_frame.boundary.path(displacement))
+    drawn, axes = empty_map(map_frame)
+    show_grey(axes, map_frame, image, material, grid)
+    draw_edge(axes, map_frame.boundary.path(displacement))
     colour_bar(axes, scale or ColourScale(style.GREY, 0.0, 1.0))
     return drawn
 
 
 def draw_shape(map_frame: MapFrame, motion: DisplacementFunction) -> Figure:
     """Draw the specimen's boundary deformed over the undeformed one; no colour bar."""
-    drawn, axes = _empty_map(map_frame)
+    drawn, axes = empty_map(map_frame)
     style.draw_path(axes, map_frame.boundary.path(), fill=False, ec=style.MUTED, lw=0.45, alpha=0.7,
                     clip_on=False)  # fmt: skip
     deformed = map_frame.boundary.path(map_frame.moved_nodes(motion))
@@ -219,9 +219,9 @@ def draw_blend(
     ``image``, ``material``, ``grid``: as for :func:`draw_image`. ``values``: (rows, cols) on
     ``map_frame.grid``, what was measured, drawn with the displacement ``motion``.
     """
-    drawn, axes = _empty_map(map_frame, width=3.2)
+    drawn, axes = empty_map(map_frame, width=3.2)
     # Gone where the field is opaque, or slivers of it would show along the holes.
-    _show_grey(axes, map_frame, image, material, grid, dissolve=True)
+    show_grey(axes, map_frame, image, material, grid, dissolve=True)
     colours = scale.of(values)
     colours[..., 3] *= _ramp(values.shape)
     _draw_cells(axes, map_frame, colours, motion)
@@ -234,7 +234,7 @@ def _draw_cells(
 ) -> None:
     """Cells (rows, cols, 4) in their colours, cut out along the boundary, and the boundary."""
     moved = None if motion is None else map_frame.moved_nodes(motion)
-    edge = _draw_edge(axes, map_frame.boundary.path(moved))
+    edge = draw_edge(axes, map_frame.boundary.path(moved))
     if motion is None:
         picture = axes.imshow(colours, extent=map_frame.grid.extent, rasterized=True,
                               interpolation="nearest", aspect="auto")  # fmt: skip
@@ -255,7 +255,7 @@ def shaded(
                           cmap=scale.colours, norm=scale.normalise)  # fmt: skip
 
 
-def _empty_map(map_frame: MapFrame, width: float = WIDTH, unit: str = "mm") -> tuple[Figure, Axes]:
+def empty_map(map_frame: MapFrame, width: float = WIDTH, unit: str = "mm") -> tuple[Figure, Axes]:
     """An empty map with a scale bar."""
     left, right, bottom, top = map_frame.limits
     size = np.array([right - left, top - bottom])
@@ -281,7 +281,8 @@ def bare_axes(
     return drawn, axes
 
 
-def _draw_edge(axes: Axes, path: Path) -> PathPatch:
+def draw_edge(axes: Axes, path: Path) -> PathPatch:
+    """Draw a boundary."""
     return style.draw_path(axes, path, fill=False, ec=style.EDGE, lw=0.5, rasterized=True,
                            clip_on=False, zorder=1.5)  # fmt: skip
 
@@ -329,7 +330,7 @@ def _ramp(shape: tuple[int, ...]) -> FloatArray:
     return np.asarray(t**2 * (3 - 2 * t))
 
 
-def _show_grey(
+def show_grey(
     axes: Axes,
     map_frame: MapFrame,
     image: NDArray[np.float32],

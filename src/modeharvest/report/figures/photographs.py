@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -32,12 +32,17 @@ from modeharvest.report.figures.curves import draw_density
 from modeharvest.report.figures.fits import UM
 from modeharvest.report.figures.maps import ColourScale
 from modeharvest.report.figures.style import BLUE, GOLD, GREEN, GREY, INK, RED
-from modeharvest.report.figures.whole_field import WholeMaps
-from modeharvest.runs.photographs.results import FrameTruth, Harvest, HarvestedFrame
+from modeharvest.report.figures.whole_field import WholeMaps, middle_pixels
+from modeharvest.runs.photographs.results import (
+    MOST_SHOWN,
+    FrameTruth,
+    Harvest,
+    HarvestedFrame,
+    shown_moments,
+)
 from modeharvest.util.arrays import FloatArray
+from modeharvest.validation.truth import lengths
 
-MOST_SHOWN = 6
-"""Photographs with pictures of their own, at most; numbers are given of all."""
 CLOSE = 3
 """Cells along the side of a closer look."""
 _NO_PATTERN = WavePattern((), None, ())
@@ -47,17 +52,11 @@ _REACH = 0.75  # spacings of a local DIC from a point, within which a cell has i
 
 
 def shown_frames(harvest: Harvest) -> tuple[HarvestedFrame, ...]:
-    """The frames with pictures: those around buckling, and evenly spaced ones."""
+    """The frames with pictures."""
     frames, moments = harvest.frames, harvest.timeline
-    if len(frames) <= MOST_SHOWN:
-        return frames
-    has_pattern = [m.has_pattern for m in moments] if len(moments) == len(frames) else []
-    first = has_pattern.index(True) if True in has_pattern else 0
-    chosen = {max(0, first - 1), first, len(frames) - 1}
-    for k in np.linspace(0, len(frames) - 1, MOST_SHOWN).round().astype(int):
-        if len(chosen) < MOST_SHOWN:
-            chosen.add(int(k))
-    return tuple(frames[k] for k in sorted(chosen))
+    if len(frames) != len(moments):
+        return frames[:MOST_SHOWN]
+    return tuple(frames[k] for k in shown_moments(moments))
 
 
 def material_boundary(harvest: Harvest) -> MeshBoundary:
@@ -174,20 +173,23 @@ def draw_part_spectrum(state: PhotographState, part: int, component: int) -> Fig
 
 def draw_residual(state: PhotographState) -> Figure:
     """Draw f - g(x + u) in the deformed configuration, single pixels; blank where not compared."""
-    map_frame, harvest = state.view.map_frame(fits.FINE), state.harvest
-    full, ansatz, a = harvest.full_scale, state.result.ansatz, state.result.unknowns
-    rows, cols = map_frame.pixels
-    x, y = harvest.grid.x[cols], harvest.grid.y[rows]
-    u = ansatz.displacement(a, x, y) / harvest.grid.pixel_size
+    map_frame = state.view.map_frame(fits.FINE)
+    values = residual_of(state, map_frame)
+    scale = ColourScale.signed(values, "" if state.harvest.full_scale else "levels", 0.99)
+    return maps.draw_field(map_frame, values, scale, state.motion)
+
+
+def residual_of(state: PhotographState, map_frame: maps.MapFrame) -> FloatArray:
+    """f - g(x + u) at the pixels of a frame; NaN where not compared."""
+    harvest, ansatz, a = state.harvest, state.result.ansatz, state.result.unknowns
+    (rows, cols), grid = map_frame.pixels, middle_pixels(map_frame, state.harvest.grid)
+    u = state.result.displacement(grid) / grid.pixel_size * map_frame.factor
     spline = SplineImage.of(np.asarray(state.frame.image), state.result.order)
     value, _, _ = spline.sample(rows[:, None] - u[..., 1], cols[None, :] + u[..., 0])
-    gain, offset = ansatz.gain_and_offset(a, x, y)
-    picked = np.ix_(rows, cols)
-    residual = (harvest.reference[picked] - gain * value - offset) / (full or 1.0)
-    compared = eroded(harvest.mask, harvest.case.correlation.edge_px)
-    values = np.where(compared[picked], residual, np.nan)
-    scale = ColourScale.signed(values, "" if full else "levels", 0.99)
-    return maps.draw_field(map_frame, values, scale, state.motion)
+    gain, offset = ansatz.gain_and_offset(a, grid.x, grid.y)
+    residual = map_frame.sample(harvest.reference) - gain * value - offset
+    compared = map_frame.sample(eroded(harvest.mask, harvest.case.correlation.edge_px))
+    return np.where(compared, residual / (harvest.full_scale or 1.0), np.nan)
 
 
 def draw_w(state: PhotographState) -> Figure:
@@ -249,17 +251,10 @@ def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
     """
     harvest, map_frame, known = state.harvest, state.view.map_frame(), truth_of(state)
     assert known is not None
-    rows, cols = map_frame.pixels
-    x, y = harvest.grid.x[cols], harvest.grid.y[rows]
-    fields: dict[str, Callable[[], FloatArray]] = {
-        "truth": lambda: np.asarray(known.displacement[np.ix_(rows, cols)], dtype=np.float64),
-        "best": lambda: known.best.ansatz.displacement(known.best.unknowns, x, y),
-        "idic": lambda: state.result.ansatz.displacement(state.result.unknowns, x, y),
-    }
-    first, second = {"true_w": ("truth", "idic"), "best": ("truth", "best"),
-                     "loss": ("best", "idic")}[part]  # fmt: skip
-    length = np.linalg.norm(fields[first]() - fields[second](), axis=-1)
-    return fits.draw_length(state, np.where(harvest.mask[np.ix_(rows, cols)], length, np.nan))
+    grid, truth = middle_pixels(map_frame, harvest.grid), map_frame.sample(known.displacement)
+    best, idic = known.best.displacement(grid), state.result.displacement(grid)
+    error = {"true_w": truth - idic, "best": truth - best, "loss": best - idic}[part]
+    return fits.draw_length(state, np.where(map_frame.sample(harvest.mask), lengths(error), np.nan))
 
 
 def truth_of(state: PhotographState) -> FrameTruth | None:

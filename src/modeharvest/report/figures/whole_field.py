@@ -61,7 +61,7 @@ class WholeMaps(Generic[S]):
     def _w(self, state: S) -> Figure:
         """Measured u - v0 - sum v_i phi_i, on the colours of the true one where it is known."""
         frame, result = state.view.map_frame(), state.result
-        grid = _pixels(frame, state.view.grid)
+        grid = middle_pixels(frame, state.view.grid)
         by_idic = result.displacement(grid)
         w = UM * lengths(self._measured(state).displacement_on(grid) - by_idic)
         true, shown = self.truth(state), w
@@ -81,16 +81,16 @@ class WholeMaps(Generic[S]):
         values = np.linalg.eigvalsh(measured.field("logarithmic"))
         is_first = np.abs(values[:, :1]) > np.abs(values[:, 1:])
         larger = np.where(is_first, values[:, :1], values[:, 1:])
-        strain = measured.on_pixels(larger, _pixels(frame, state.view.grid))[..., 0]
+        strain = measured.on_pixels(larger, middle_pixels(frame, state.view.grid))[..., 0]
         return draw_field(frame, strain, ColourScale.signed(strain, "", _SHARE), state.motion)
 
     def _deviation(self, state: S) -> Figure:
         frame, measured = state.view.map_frame(), self._measured(state)
-        sd = measured.standard_deviation_on(_pixels(frame, state.view.grid))
+        sd = measured.standard_deviation_on(middle_pixels(frame, state.view.grid))
         return fits.draw_length(state, lengths(sd), share=_SHARE)
 
 
-def _pixels(frame: MapFrame, grid: PixelGrid) -> PixelGrid:
+def middle_pixels(frame: MapFrame, grid: PixelGrid) -> PixelGrid:
     """The images' pixels in the middle of a map's cells."""
     rows, cols = frame.pixels
     x, y = grid.to_mm(rows[0], cols[0])

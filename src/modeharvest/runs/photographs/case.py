@@ -6,10 +6,11 @@ Only files, scale and cell size must be there. Paths are relative to the TOML fi
 
 from __future__ import annotations
 
+import glob
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from pydantic import PrivateAttr
 
@@ -17,9 +18,11 @@ from modeharvest.idic.local.subsets import SubsetOptions
 from modeharvest.idic.photograph.geometry import Corners, SpecimenTable
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.runs.case import CaseModel
+from modeharvest.runs.photographs.machine_log import LogTable
+from modeharvest.runs.photographs.sequence import ChosenFrames, FrameChoice
 from modeharvest.runs.whole_field import WholeFieldOptions
 from modeharvest.util.errors import InputError, require_within
-from modeharvest.util.typed import nearest
+from modeharvest.util.typed import nearest, to_plain
 
 LOCAL = ("none", "pyvale", "file")
 
@@ -31,12 +34,12 @@ class LocalTable:
     code: str = "none"
     """Either "none", "pyvale" (an optional package), or "file" for fields of any other code."""
     files: tuple[str, ...] = ()
-    """A field for each deformed image (CSV, NPZ, HDF5, MAT), with code = "file"."""
+    """With code = "file": a field for each deformed image, or one file of Ncorr with all."""
     unit: str = "auto"
     y_axis: str = "auto"
-    """Of the files, "px" or "mm", and "down" or "up"; "auto" as their columns' names say."""
-    first_pixel: int = 0
-    """What the files call the first pixel, 0 or 1."""
+    """Of the files, "px" or "mm", and "down" or "up"; "auto" as they themselves say."""
+    first_pixel: int | None = None
+    """What the files call the first pixel, 0 or 1; None as their code does."""
     columns: dict[str, str | int] = field(default_factory=dict)
     """Names, or numbers from 1, of the files' columns for "x", "y", "u" and "v", where they can't
     be known by themselves."""
@@ -57,7 +60,7 @@ class LocalTable:
                 "local: expected unit 'auto', 'px' or 'mm' and y_axis 'auto', 'down' or 'up', got "
                 f"{self.unit!r} and {self.y_axis!r}"
             )
-        require_within("local: expected a first_pixel", self.first_pixel, 0, 1)
+        require_within("local: expected a first_pixel", self.first_pixel or 0, 0, 1)
         SubsetOptions(self.subset, self.step)  # checks them
 
 
@@ -75,17 +78,19 @@ class NoiseTable:
 
 
 @dataclass(frozen=True)
-class Images:
+class Images(FrameChoice):
     """The photographs."""
 
     reference: str = ""
+    """A file; or a video's first frame, and with test.mp4#12 that one."""
     deformed: tuple[str, ...] = ()
-    """Files of the deformed states in the order of the test; a name may have wildcards, whose
-    matches come in the order of their names."""
+    """Files of the deformed states in the order of the test, folders or videos; a name may have
+    wildcards, whose matches come in the order of the numbers in their names."""
     repeats: tuple[str, ...] = ()
     """Further exposures of the undeformed state, from which the noise is measured."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.reference or not self.deformed:
             raise InputError(
                 "images: expected a reference and at least one deformed image, got "
@@ -150,6 +155,7 @@ class PhotographCase(CaseModel):
     table = "images"
 
     images: Images
+    log: LogTable = LogTable()
     scale: ImageScale
     specimen: SpecimenTable
     distortion: DistortionTable = DistortionTable()
@@ -159,11 +165,32 @@ class PhotographCase(CaseModel):
     whole_field: WholeFieldOptions = WholeFieldOptions()
 
     _base: Path = PrivateAttr(Path())
+    _written: Images | None = PrivateAttr(None)
+    _sequence: ChosenFrames | None = PrivateAttr(None)
 
     @property
     def base(self) -> Path:
         """The folder that files' names are relative to."""
         return self._base
+
+    @property
+    def sequence(self) -> ChosenFrames | None:
+        """How its photographs were found and chosen; None before that."""
+        return self._sequence
+
+    def of_frames(self, sequence: ChosenFrames) -> Self:
+        """The same case, its photographs those that were chosen; :meth:`plain` is as it was."""
+        reference, *deformed = (str(p.absolute()) for p in (sequence.reference, *sequence.deformed))
+        names = tuple(map(glob.escape, deformed))
+        images = replace(self.images, reference=reference, deformed=names)
+        case = self.model_copy(update={"images": images})
+        case._written, case._sequence = self._written or self.images, sequence
+        return case
+
+    def plain(self) -> dict[str, Any]:
+        """The case as plain JSON values, with the photographs' names as they were written."""
+        plain = super().plain()
+        return plain if self._written is None else plain | {"images": to_plain(self._written)}
 
     @classmethod
     def read(cls, name: str | Path) -> Self:

@@ -6,6 +6,7 @@
     prepared/                           prepare     photographs without distortion, masks
     results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
     results/NAME_start.json                         where it started from, in words
+    results/NAME_holes.csv                          the holes' shapes, where there is no speckle
     whole_field/NAME.h5  NAME.vtu                   whole displacements, where they are asked for
     whole_field/NAME_refit.json                     the ansatz of the result, refitted to it
     report.html  summary.json           report      everything that was found
@@ -14,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -38,10 +39,17 @@ from modeharvest.idic.photograph.measure import (
     residual_test,
     warped_back,
 )
+from modeharvest.idic.photograph.plain import (
+    PlainSurface,
+    measure_contours,
+    plain_surface,
+    write_holes,
+)
 from modeharvest.idic.result import Result
+from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum
-from modeharvest.idic.uncertainty.covariance import covariance, field_errors
+from modeharvest.idic.uncertainty.covariance import Covariance, covariance, field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
@@ -50,13 +58,17 @@ from modeharvest.runs.photographs import prepare
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
 from modeharvest.runs.photographs.results import (
+    MOST_SHOWN,
     Harvest,
     HarvestedFrame,
     HarvestTruth,
     PartSpectrum,
     amplitude_of,
+    frame_numbers,
     harvest_summary,
+    shown_moments,
 )
+from modeharvest.runs.photographs.sequence import named_files
 from modeharvest.runs.whole_field import WholeFields, change_of, with_remedy
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -87,7 +99,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             return Optics(read_distortion(base / table.file))
         if not table.calibration:
             return Optics()
-        files = prepare.named_files(base, table.calibration, unique=False)
+        files = named_files(base, table.calibration, unique=False)
 
         def work() -> tuple[Path, ...]:
             prepare.calibrate_lens(table, base, self.folder, self.progress)
@@ -115,7 +127,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         prepared, table = self.prepared, self.case.specimen
         return find_geometry(prepared.mask(), prepared.grid, table, self.case.base)
 
-    def results(self) -> dict[str, MeasuredPhotograph]:
+    def results(self) -> Mapping[str, MeasuredPhotograph]:
         """Correlate every photograph, each after the one before; leaves ``results/``.
 
         One that can't be measured is left out (see :meth:`failures`), and the next goes on from
@@ -147,18 +159,13 @@ class HarvestRun(StagedRun[PhotographCase]):
         """All that is known of the test, for the report."""
         case, prepared, region = self.case, self.prepared, self.geometry.region
         results, source = self.results(), Path(self.source)
-        names = counted(tuple(results), self.progress, "error bars")
-        frames = [self._frame(name, results[name]) for name in names]
-        moments = [amplitude_of(frame, region.cellular) for frame in frames]
-        return Harvest(
+        known = Harvest(
             case,
             self.geometry,
             prepared.image(),
-            tuple(frames),
+            (),
             prepared.noise,
             skipped=(*prepared.skipped, *self.failures()),
-            timeline=moments,
-            buckling=find_buckling(moments),
             optics=self.optics,
             full_scale=prepared.full_scale,
             text=(*prepared.notes, *region.text),
@@ -166,6 +173,22 @@ class HarvestRun(StagedRun[PhotographCase]):
             command=f"modeharvest harvest {self.source} --out {self.folder}",
             toml=source.read_text("utf-8") if source.is_file() else "",
             versions=versions(*prepare.LIBRARIES),
+        )
+        moments, numbers, kept = [], [], {}
+        for name in counted(tuple(results), self.progress, "error bars"):
+            frame = self._frame(name, results[name])
+            moments.append(amplitude_of(frame, region.cellular))
+            numbers.append(frame_numbers(replace(known, timeline=moments[-1:]), frame))
+            if len(results) <= MOST_SHOWN:  # of more, not all have room in the memory at once
+                kept[name] = frame
+        shown = [moments[k].name for k in shown_moments(moments)]
+        frames = (kept.get(name) or self._frame(name, results[name]) for name in shown)
+        return replace(
+            known,
+            frames=tuple(frames),
+            numbers=tuple(numbers),
+            timeline=moments,
+            buckling=find_buckling(moments),
         )
 
     def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
@@ -189,27 +212,18 @@ class HarvestRun(StagedRun[PhotographCase]):
     # -- parts --------------------------------------------------------------------------
 
     @cached_property
-    def _correlated(self) -> tuple[dict[str, MeasuredPhotograph], dict[str, str]]:
+    def _correlated(self) -> tuple[Mapping[str, MeasuredPhotograph], dict[str, str]]:
         """Photographs that were measured, and why others could not be."""
-        case = self.case
         _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
 
         def work(
             name: str, last: tuple[str, MeasuredPhotograph] | None
         ) -> tuple[Sequence[Path], dict[str, Any]]:
-            pair, (result, field, _) = self._pair(name, last), self._paths(name)
-            measured = measure(
-                pair,
-                self.geometry,
-                case.specimen.cell_size,
-                case.correlation,
-                prepare.local_field(case, self.prepared, name, self.optics.distortion),
-                last and last[1],
-                self.progress,
-            )
-            files: Sequence[Path] = ()
-            if case.whole_field.measure:
-                measured, files = self._with_whole(name, pair, measured)
+            result, field, _ = self._paths(name)
+            if self._plain is not None:
+                measured, files = self._by_contours(name, self._plain)
+            else:
+                measured, files = self._correlated_pair(name, last)
             write_field(field, measured.local)
             measured.result.write(result)
             whole = measured.whole and measured.whole.start
@@ -225,6 +239,55 @@ class HarvestRun(StagedRun[PhotographCase]):
 
         return self.do_in_turn("correlate", self._keys, self.folder / "results", work, read)
 
+    def _correlated_pair(
+        self, name: str, last: tuple[str, MeasuredPhotograph] | None
+    ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
+        """A photograph that was correlated, and the files of its whole displacement if wanted."""
+        case, pair = self.case, self._pair(name, last)
+        measured = measure(
+            pair,
+            self.geometry,
+            case.specimen.cell_size,
+            case.correlation,
+            prepare.local_field(case, self.prepared, name, self.optics.distortion),
+            last and last[1],
+            self.progress,
+        )
+        if not case.whole_field.measure:
+            return measured, ()
+        return self._with_whole(name, pair, measured)
+
+    @cached_property
+    def _plain(self) -> PlainSurface | None:
+        """What the reference shows if the specimen has no speckle."""
+        if not self.prepared.is_plain:
+            return None
+        if self.case.local.code != "none":
+            raise InputError(
+                f"local: expected code = 'none', got {self.case.local.code!r}: a specimen without "
+                "speckle is measured by its contours; leave [local] out"
+            )
+        return plain_surface(self.prepared.image(), self.case.images.reference)
+
+    def _by_contours(
+        self, name: str, plain: PlainSurface
+    ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
+        """A photograph that was measured by its contours, and the files of that."""
+        case, (body, _), holes = self.case, self._mesh, self.folder / f"results/{name}_holes.csv"
+        found, contours = measure_contours(
+            plain, self.prepared.pair(name), name, self.geometry, case.specimen.cell_size,
+            case.correlation, body, self.progress,
+        )  # fmt: skip
+        write_holes(holes, contours)
+        return found, (holes, *self._whole_files(name, found))
+
+    def _whole_files(self, name: str, found: MeasuredPhotograph) -> tuple[Path, ...]:
+        """Write a whole displacement and the ansatz refitted to it."""
+        whole, refit = found.whole, self._paths(name)[-1]
+        assert whole
+        whole.refit.write(refit)
+        return (*self._wholes.write(name, whole.measured, Given(correlation=found.result)), refit)
+
     @cached_property
     def _mesh(self) -> tuple[Body, FiniteElementOptions]:
         """Of the reference's material, and how to measure on it."""
@@ -238,7 +301,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
         One that can't be measured so keeps its modes, and has a warning.
         """
-        case, refit = self.case, self._paths(name)[-1]
+        case = self.case
         try:
             with with_remedy(name):
                 found = measure_whole(
@@ -247,11 +310,7 @@ class HarvestRun(StagedRun[PhotographCase]):
                 )  # fmt: skip
         except InputError as error:
             return replace(first, warnings=(*first.warnings, str(error))), ()
-        assert found.whole
-        given = Given(correlation=found.result)
-        files = self._wholes.write(name, found.whole.measured, given)
-        found.whole.refit.write(refit)
-        return found, (*files, refit)
+        return found, self._whole_files(name, found)
 
     def _frame(self, name: str, measured: MeasuredPhotograph) -> HarvestedFrame:
         """One photograph's measurement, with its error bars and spectra."""
@@ -260,7 +319,12 @@ class HarvestRun(StagedRun[PhotographCase]):
         box = geometry.region.cellular
         x, y = _axes(geometry.region.domain)
         noise, edge_px = image_noise(pair, self.prepared.noise), case.correlation.edge_px
-        found = covariance(result, pair, noise, cell, edge_px)
+        if self._plain is not None and measured.whole:
+            found = Covariance(result.covariance(), measured.whole.refit.covariance())
+            test = ResidualTest(result.residual_correlation, result.pixels)
+        else:
+            found = covariance(result, pair, noise, cell, edge_px)
+            test = residual_test(result, pair, noise, edge_px)
         by_model_error = found.by_model_error
         along, across = mean_strain(result, box)
         spectrum = measured_spectrum(measured.local, cell, box)
@@ -268,7 +332,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         known, w = measured.local, None
         parts = geometry.parts if len(geometry.parts) > 1 else {}
         own = {n: measured_spectrum(known, cell, box) for n, box in parts.items()}
-        if case.whole_field.measure or case.local.code != "none":
+        if case.whole_field.measure or self._plain is not None or case.local.code != "none":
             w = known.less(partial(result.ansatz.displacement_at, result.unknowns))
             own["w"] = measured_spectrum(w, cell, box)
         return HarvestedFrame(
@@ -279,7 +343,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             mask=pair.deformed_mask,
             result=result,
             identifiability=identifiability(result, pair.mask),
-            residual_test=residual_test(result, pair, noise, edge_px),
+            residual_test=test,
             error_x=x,
             error_y=y,
             by_noise=field_errors(result, x, y, found.by_noise),
@@ -291,6 +355,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()),
             w=w,
             whole=measured.whole,
+            rigid=self.prepared.rigid.get(name),
             start_text=tuple(s for s in measured.text if s not in pattern.text),
             warnings=(*found.warnings, *measured.warnings),
         )
@@ -335,7 +400,7 @@ def harvest(
     """
     found = PhotographCase.of(case)
     found = found.model_copy(update=change_of(found.whole_field, whole_field))
-    prepare.require_inputs(found)
+    prepare.require_inputs(found := prepare.with_chosen_frames(found, Path(folder), progress))
     source = "CASE" if isinstance(case, CaseModel) else str(case)
     return HarvestRun(found, Path(folder), progress, source).all()
 

@@ -6,18 +6,22 @@ are white on material. A local DIC's field is another code's file, or pyvale's s
 
 from __future__ import annotations
 
-import glob
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import label
 
 from modeharvest.idic.local.field import LocalField, read_field, without_distortion
+from modeharvest.idic.local.formats import frames_of
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
+from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
+from modeharvest.idic.photograph.matching import RigidMotion, rigid_motion
 from modeharvest.idic.photograph.material import find_material, window_for
-from modeharvest.idic.photograph.plain import require_speckle
+from modeharvest.idic.photograph.plain import plain_surface
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial, calibrate
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
@@ -44,9 +48,11 @@ from modeharvest.imaging.photographs.photograph import (
 )
 from modeharvest.report.model import text_of
 from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
+from modeharvest.runs.photographs.sequence import chosen_frames, named_files
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError, WriteError
 from modeharvest.util.files import read_json, reading, write_json
+from modeharvest.util.masks import grown
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import made, picked, to_plain
 
@@ -54,6 +60,7 @@ PREPARED_FILE = "prepared.json"
 LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 CODE = ("fem", "imaging", "idic", "runs")
 """What numbers from photographs depend on: libraries, and folders of the package."""
+_PLAIN = "The material has no speckle: it is told from the background by its grey level."
 _ARRAYS = "shifts shifts_sd angles angles_sd matches covariance"
 
 
@@ -74,6 +81,11 @@ class PreparedPhotographs:
     """The camera's largest grey level."""
     notes: tuple[str, ...] = ()
     """What was done to the photographs."""
+    is_plain: bool = False
+    """Whether they show no speckle: then their contours are measured."""
+    rigid: Mapping[str, RigidMotion] = field(default_factory=dict)
+    """By their names, how those that were turned as a whole had moved; they are as if they hadn't.
+    """
 
     @classmethod
     def read(cls, folder: Path) -> PreparedPhotographs:
@@ -101,39 +113,16 @@ class PreparedPhotographs:
         return ImagePair(self.image(), self.image(name), self.grid, self.mask(), self.mask(name))
 
 
-def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
-    """The files that names, or patterns with wildcards, stand for.
-
-    Raises InputError if a pattern matches no file, or, with ``unique``, two have the same stem:
-    results are named by it.
-    """
-    paths: list[Path] = []
-    for name in names:
-        if any(sign in name for sign in "*?["):
-            found = sorted(p for p in map(Path, glob.glob(str(base / name))) if p.is_file())
-            if not found:
-                raise InputError(f"expected files that match {base / name}, found none")
-            paths += found
-        else:
-            paths.append(base / name)
-    stems = [path.stem for path in paths]
-    twice = next((stem for stem in stems if stems.count(stem) > 1 or stem == "reference"), None)
-    if unique and twice is not None and len(paths) > 1:
-        raise InputError(
-            f"expected images whose names differ, and none called 'reference', got {twice!r} "
-            "again; rename it, or narrow the pattern"
-        )
-    return tuple(paths)
-
-
 def of_each_photograph(case: PhotographCase, names: Sequence[str], what: str) -> dict[str, Path]:
     """The file that goes with each deformed photograph, by the photograph's name.
 
-    ``names`` of the files, or patterns; none at all is all right. Raises InputError if there
-    aren't as many as photographs; ``what`` begins the message.
+    ``names`` of the files, or patterns; none at all is all right, and so is one with a field for
+    each. Raises InputError if there aren't as many as photographs; ``what`` begins the message.
     """
     files = named_files(case.base, names, unique=False)
     photographs = named_files(case.base, case.images.deformed)
+    if len(files) == 1 and frames_of(files[0]) == len(photographs):
+        files *= len(photographs)
     if files and len(files) != len(photographs):
         raise InputError(
             f"{what}: expected one file for each of {len(photographs)} deformed images, got "
@@ -149,6 +138,20 @@ def all_files(case: PhotographCase) -> tuple[Path, ...]:
     names += [table.material, table.cells, *table.deformed_material]
     names += [lens.file, *lens.calibration]
     return named_files(case.base, [name for name in names if name], unique=False)
+
+
+def with_chosen_frames(
+    case: PhotographCase, folder: Path, progress: Progress = silent
+) -> PhotographCase:
+    """A case whose photographs are files: folders, videos and choices among them are resolved.
+
+    ``folder``: of the run, where frames of videos go. InputError if nothing is left to measure.
+    """
+    images = case.images
+    found = chosen_frames(
+        case.base, images.reference, images.deformed, images, case.log, folder, progress
+    )
+    return case.of_frames(found)
 
 
 def require_inputs(case: PhotographCase) -> None:
@@ -244,29 +247,41 @@ def prepare(
     Raises InputError if the reference can't be used, or none of the deformed images.
     """
     images, table, base = case.images, case.specimen, case.base
-    window = window_for(table.cell_size / case.scale.mm_per_px)
+    window = window_for(cell_px := table.cell_size / case.scale.mm_per_px)
 
-    def save(
-        name: str, photograph: Photograph, given: Path | None
-    ) -> tuple[BoolArray, Sequence[str]]:
-        """Write image and mask without distortion; returns the photograph's own :func:`_mask`."""
-        image, (mask, text) = photograph.image, _mask(photograph, given, window)
-        own = mask
+    def save(name: str, photograph: Photograph, found: ShownMaterial) -> None:
+        """Write image and mask without distortion."""
+        image, mask = photograph.image, found.mask
         if distortion is not None:
             image, mask = undistorted(image, distortion), undistorted_mask(mask, distortion)
+        if name != "reference" and (turned := _turned(lattice, mask)) is not None:
+            rigid[name] = turned
+            image, mask = turned.undone(image, mask)
         write_image(folder / f"{name}.tif", image)
         write_image(folder / f"{name}_mask.tif", mask)
-        return own, text
 
+    rigid: dict[str, RigidMotion] = {}
     reference = read_reference(base / images.reference)
-    mask, text = save("reference", reference, base / table.material if table.material else None)
+    own = _material(reference, base / table.material if table.material else None, window)
+    own = own if table.material else _one_specimen(own, cell_px)
+    save("reference", reference, own)
+    lattice = None
+    if case.local.code != "file":  # fields of other codes know the motion as it is
+        with suppress(InputError):
+            lattice = find_hole_lattice(read_mask(folder / "reference_mask.tif"))
     deformed = named_files(base, images.deformed)
     masks = of_each_photograph(case, table.deformed_material, "specimen.deformed_material")
-    names, skipped, notes = [], [], [*reference.notes, *text]
+    names, skipped = [], list(case.sequence.skipped if case.sequence else ())
+    notes = [*reference.notes, *own.text, *(case.sequence.notes if case.sequence else ())]
     for path in counted(deformed, progress, "prepare photographs"):
         try:
             frame = read_frame(path, reference)
-            save(path.stem, frame, masks.get(path.stem))
+            shown = _material(frame, masks.get(path.stem), window)
+            _require_alike(own, shown, path)
+            shown = _one_specimen(shown, cell_px, own)
+            if not (case.correlation.brightness.size or own.is_plain):
+                frame = _lit_as(reference, own.mask, frame, shown.mask)
+            save(path.stem, frame, shown)
         except WriteError:
             raise
         except InputError as error:
@@ -283,10 +298,12 @@ def prepare(
         folder,
         tuple(names),
         tuple(skipped),
-        _noise(case, reference, mask),
+        _noise(case, reference, own.mask),
         PixelGrid.centred(*reference.shape, case.scale.mm_per_px),
         float(reference.full_scale),
         tuple(notes),
+        own.is_plain,
+        rigid,
     )
     content = to_plain(prepared)
     del content["folder"]
@@ -294,17 +311,99 @@ def prepare(
     return prepared
 
 
-def _mask(
-    photograph: Photograph, given: Path | None, window: int
-) -> tuple[BoolArray, Sequence[str]]:
-    """Where a photograph shows material, as given or as found, and how it was found."""
-    if given is None:
-        require_speckle(photograph.image, photograph.path)
-        found = find_material(photograph.image, window)
-        return found.mask, found.text
-    mask = read_mask(given)
-    require_same_shape(photograph.image, mask, str(photograph.path), str(given))
-    return mask, ()
+@dataclass(frozen=True, eq=False)
+class ShownMaterial:
+    """Where a photograph shows material."""
+
+    mask: BoolArray
+    """(rows, cols) True there."""
+    text: tuple[str, ...] = ()
+    """How it was found."""
+    is_plain: bool = False
+    """Whether the material has no speckle."""
+
+
+def _material(photograph: Photograph, given: Path | None, window: int) -> ShownMaterial:
+    """The material of a photograph, as given or as found."""
+    if given is not None:
+        mask = read_mask(given)
+        require_same_shape(photograph.image, mask, str(photograph.path), str(given))
+        return ShownMaterial(mask)
+    plain = plain_surface(photograph.image, str(photograph.path))
+    if plain is not None:
+        return ShownMaterial(plain.mask, (_PLAIN,), True)
+    found = find_material(photograph.image, window)
+    return ShownMaterial(found.mask, found.text)
+
+
+def _require_alike(reference: ShownMaterial, deformed: ShownMaterial, path: Path) -> None:
+    """InputError if one shows speckle and the other one doesn't."""
+    if reference.is_plain != deformed.is_plain:
+        kinds = "a specimen with speckle", "a specimen without speckle"
+        raise InputError(
+            f"expected {kinds[reference.is_plain]} in {path}, like the reference's, got "
+            f"{kinds[deformed.is_plain]}"
+        )
+
+
+_SECOND = 0.2
+"""Of the largest connected part of the material: from this size on another one is a specimen."""
+
+
+def _one_specimen(
+    shown: ShownMaterial, cell_px: float, like: ShownMaterial | None = None
+) -> ShownMaterial:
+    """The largest of several specimens in a photograph, or the one where the reference's was.
+
+    What is less than half a cell apart is one.
+    """
+    for apart_px in (0.0, 0.25 * cell_px):  # the first is quick
+        parts, count = label(grown(shown.mask, apart_px) if apart_px else shown.mask)
+        sizes = np.bincount(parts[shown.mask], minlength=count + 1)[1:]
+        if count < 2 or np.sort(sizes)[-2] < _SECOND * sizes.max():
+            return shown
+    mine = sizes if like is None else np.bincount(parts[like.mask], minlength=count + 1)[1:]
+    chosen = 1 + int(np.argmax(mine))
+    number = int((sizes >= _SECOND * sizes.max()).sum())
+    text = (
+        f"There are {number} specimens in the picture; the one of {sizes[chosen - 1]} px was "
+        "measured: give a mask of another one as material."
+    )
+    return replace(shown, mask=shown.mask & (parts == chosen), text=(*shown.text, text))
+
+
+_LIGHT = 0.03
+"""Relative change of the material's mean or contrast from which on the light has changed."""
+
+
+def _lit_as(
+    reference: Photograph, mask: BoolArray, frame: Photograph, shown: BoolArray
+) -> Photograph:
+    """A photograph with the mean and the contrast of the reference's material if its differ."""
+    f, g = reference.image[mask], frame.image[shown]
+    mean, contrast = float(f.mean(dtype=np.float64)), float(f.std(dtype=np.float64))
+    gain = contrast / max(float(g.std(dtype=np.float64)), 1e-12)
+    brighter = float(g.mean(dtype=np.float64)) / max(mean, 1e-12)
+    if abs(gain - 1.0) < _LIGHT and abs(brighter - 1.0) < _LIGHT:
+        return frame
+    level = mean - gain * brighter * mean
+    note = (
+        f"{frame.path.name}: the light had changed, its levels g became {gain:.3f} g + {level:.3g}."
+    )
+    image = np.float32(gain) * frame.image + np.float32(level)
+    return replace(frame, image=image.astype(np.float32), notes=(*frame.notes, note))
+
+
+_TURNED_DEG = 0.5
+"""From which on a specimen's rotation is taken out of its photograph: a pattern turns with it."""
+
+
+def _turned(lattice: HoleLattice | None, mask: BoolArray) -> RigidMotion | None:
+    """How a specimen has moved as a whole, if it has turned; None, too, where that isn't known."""
+    with suppress(InputError):
+        motion = None if lattice is None else rigid_motion(lattice, find_hole_lattice(mask))
+        return motion if motion and abs(motion.angle_deg) > _TURNED_DEG else None
+    return None
 
 
 def _noise(case: PhotographCase, reference: Photograph, mask: BoolArray) -> CameraNoise:
@@ -331,9 +430,9 @@ def local_field(
         return None
     if table.code == "pyvale":
         return subset_field(prepared.pair(name), SubsetOptions(table.subset, table.step))
-    path = of_each_photograph(case, table.files, "local.files")[name]
+    files = of_each_photograph(case, table.files, "local.files")
+    frame = list(files).index(name) + 1 if len({*files.values()}) < len(files) else None
     units, y_axis = (None if it == "auto" else it for it in (table.unit, table.y_axis))
-    field = read_field(
-        path, grid, units=units, y_axis=y_axis, first_pixel=table.first_pixel, columns=table.columns
-    )
-    return field if distortion is None else without_distortion(field, grid, distortion)
+    how = picked(table, "first_pixel columns")
+    found = read_field(files[name], grid, units=units, y_axis=y_axis, frame=frame, **how)
+    return found if distortion is None else without_distortion(found, grid, distortion)

@@ -1,6 +1,6 @@
 """What was found in photographs of a test: its result types, and their ``summary.json``.
 
-Keys of the latter: docs/harvest.md.
+Keys of the latter: docs/how-to/harvest.md.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.holes import HoleLattice
+from modeharvest.idic.photograph.matching import RigidMotion
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.noise import CameraNoise
 from modeharvest.idic.solver.residual_test import ResidualTest
@@ -29,6 +30,7 @@ from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import Optics, calibration_text
+from modeharvest.runs.photographs.sequence import recorded_with
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import Buckling, ImageAmplitude
@@ -80,9 +82,17 @@ class HarvestedFrame:
     """What the ansatz leaves of a local DIC's field, or of the whole displacement's."""
     whole: WholeField | None = None
     """The whole displacement, if it was measured."""
+    rigid: RigidMotion | None = None
+    """What was taken out of the photograph before it was measured; None if it was as good as
+    upright."""
     start_text: tuple[str, ...] = ()
     """Where the correlation started from."""
     warnings: tuple[str, ...] = ()
+
+    @property
+    def by_contours(self) -> bool:
+        """Whether contours were measured, and the ansatz was fitted to the displacement."""
+        return self.whole is not None and self.whole.measured.shown == "contours"
 
     @property
     def modes(self) -> range:
@@ -123,8 +133,10 @@ class Harvest:
     reference: FloatImage
     """(rows, cols) the photograph of the undeformed state, free from distortion [grey levels]."""
     frames: tuple[HarvestedFrame, ...]
-    """In the order of the test."""
+    """In the order of the test; of many only those that :func:`shown_moments` names."""
     noise: CameraNoise
+    numbers: Sequence[Mapping[str, Any]] = ()
+    """``frames`` of the summary, of all photographs; by default those of ``frames``."""
     skipped: tuple[tuple[str, str], ...] = ()
     """Names of photographs that were not used, and why."""
     timeline: Sequence[ImageAmplitude] = ()
@@ -167,6 +179,24 @@ def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
         model_error_px=identified.model_error_px,
         noise_px=noise.get("fluctuation", 0.0),
     )
+
+
+MOST_SHOWN = 6
+"""Photographs with pictures of their own, at most; numbers are given of all."""
+
+
+def shown_moments(moments: Sequence[ImageAmplitude]) -> tuple[int, ...]:
+    """Which of a test's photographs have pictures: around buckling, and evenly spaced ones."""
+    count = len(moments)
+    if count <= MOST_SHOWN:
+        return tuple(range(count))
+    has_pattern = [m.has_pattern for m in moments]
+    first = has_pattern.index(True) if True in has_pattern else 0
+    chosen = {max(0, first - 1), first, count - 1}
+    for k in np.linspace(0, count - 1, MOST_SHOWN).round().astype(int):
+        if len(chosen) < MOST_SHOWN:
+            chosen.add(int(k))
+    return tuple(sorted(chosen))
 
 
 def rms_errors(frame: HarvestedFrame, errors: FieldErrors, box: Box) -> dict[str, float]:
@@ -250,6 +280,10 @@ def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str
     }
 
 
+_FITTED = "The ansatz is fitted to a displacement: what is left of that is w."
+_ALIKE = "Displacements of all pixels of the material count alike."
+
+
 def harvest_summary(harvest: Harvest) -> dict[str, Any]:
     """The content of ``summary.json``, plain JSON values."""
     summary = {
@@ -264,7 +298,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
             "of_full_scale": _share(harvest.noise.sd, harvest.full_scale),
             "source": harvest.noise.source,
         },
-        "frames": [_frame(harvest, frame) for frame in harvest.frames],
+        "frames": harvest.numbers or [frame_numbers(harvest, frame) for frame in harvest.frames],
         "timeline": [
             picked(m, "name strain amplitude_px model_error_px noise_px has_pattern")
             for m in harvest.timeline
@@ -281,22 +315,27 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
     return plain
 
 
-def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
+def frame_numbers(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
+    """What ``summary.json`` says of a photograph, which need not be among the harvest's frames."""
     result, identified = frame.result, frame.identifiability
+    residual = None if frame.by_contours else result.residual_rms
     moment = next((m for m in harvest.timeline if m.name == frame.name), None)
     return {
         **picked(frame, "name strain_x strain_y"),
+        **recorded_with(harvest.case.sequence, frame.name),
         "strain": moment.strain if moment else max(frame.strain_x, frame.strain_y, key=abs),
         "has_pattern": moment and moment.has_pattern,
         "outcome": result.outcome.name.lower(),
         "outcome_why": result.outcome.explanation,
-        **picked(result, "iterations pixels residual_rms"),
+        "shown": "contours" if frame.by_contours else "speckle",
+        **picked(result, "iterations pixels"),
         "iterations_all_levels": len(result.history),
-        "residual_of_full_scale": _share(result.residual_rms, harvest.full_scale),
+        "residual_rms": residual,
+        "residual_of_full_scale": _share(residual, harvest.full_scale),
         "residual_correlation": frame.residual_test.correlation,
         "chi_square": frame.residual_test.chi_square,
-        "residual_test": frame.residual_test.text,
-        "weighting": result.weighting.text,
+        "residual_test": _FITTED if frame.by_contours else frame.residual_test.text,
+        "weighting": _ALIKE if frame.by_contours else result.weighting.text,
         **picked(identified, "model_error_px condition_number undetermined"),
         "errors_px": {
             "noise": rms_errors(frame, frame.by_noise, harvest.geometry.region.cellular),
@@ -307,6 +346,7 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "whole_field": _whole(harvest, frame),
         "modes": [mode_numbers(harvest, frame, i) for i in frame.modes],
         "pattern_reading": () if frame.pattern is None else frame.pattern.text,
+        "rigid_motion": frame.rigid,
         "start": frame.start_text,
         "warnings": (*_frame_warnings(frame), *frame.warnings),
     }  # fmt: skip
@@ -373,5 +413,5 @@ def _optics(harvest: Harvest, lens: Distortion) -> dict[str, Any]:
     return summary
 
 
-def _share(level: float, full_scale: float | None) -> float | None:
-    return level / full_scale if full_scale else None
+def _share(level: float | None, full_scale: float | None) -> float | None:
+    return level / full_scale if full_scale and level is not None else None

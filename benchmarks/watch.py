@@ -1,0 +1,217 @@
+"""A test that is watched: seconds a photograph, and the strain of buckling before it comes.
+
+scripts/env python benchmarks/watch.py            # predictions, eight seeds of imperfections
+scripts/env python benchmarks/watch.py --time     # seconds a photograph of 3 Mpx
+scripts/env python benchmarks/watch.py --memory harvest 20 200    # peak of so many photographs
+scripts/env python benchmarks/watch.py --memory measure 5 25
+scripts/env python benchmarks/watch.py --seeds 1 --picture docs/images/watch.png
+
+Specimens of the paper's kind, 6 x 10 holes scattered by 0.01 mm in place and diameter, simulated at
+strains up to 0.95 of the perfect one's critical strain, photographed with 8 bits and noise of 1 %,
+and measured as `modeharvest harvest --watch` does. docs/how-to/sequences.md has the numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Solution
+from modeharvest.fem.specimen import Imperfection
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.report.figures import style
+from modeharvest.report.figures.sequence import draw_amplitude, draw_growth
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.watch import QuickMeasurement, WatchedTest
+from modeharvest.validation.growth import follow_growth
+
+SHARES = np.linspace(0.05, 0.95, 19)
+"""Of the critical strain, at which photographs are taken."""
+ASKED = (0.5, 0.6, 0.7, 0.8)
+
+
+def solved(experiment: Experiment, path: Path) -> Solution:
+    """A solution, computed once."""
+    from modeharvest.fem.simulate import simulate
+
+    if not path.is_file():
+        simulate(experiment).write(path)
+    return Solution.read(path)
+
+
+def photographed(solution: Solution, folder: Path, pixel_size: float) -> Path:
+    """Photographs of all states; returns the experiment's TOML file."""
+    sensor = Sensor(read_noise=0.01)
+    made = make_images(solution, ImagingSpec(pixel_size=pixel_size, sensor=sensor), folder)
+    for old in folder.glob("truth_*.h5"):
+        old.unlink()
+    shots = folder / "shots"
+    shots.mkdir(exist_ok=True)
+    for strain in made.strains:
+        name = f"deformed_{1e4 * strain:04.0f}_8bit.tif"
+        (shots / name).write_bytes((folder / name).read_bytes())
+    path = folder / "experiment.toml"
+    path.write_text(
+        '[images]\nreference = "reference_8bit.tif"\ndeformed = ["shots"]\n'
+        f"[scale]\npixel_size = {pixel_size}\n[specimen]\ncell_size = 1.9\n"
+    )
+    return path
+
+
+def watched(experiment: Path) -> list[dict[str, float]]:
+    """Every photograph, measured in turn."""
+    measuring = QuickMeasurement(PhotographCase.read(experiment))
+    return [measuring.measure(path) for path in sorted((experiment.parent / "shots").iterdir())]
+
+
+def small_photographs(folder: Path, count: int) -> Path:
+    """A reference and so many states of 300 x 300 px, compressed by up to 4 %."""
+    shots, pixel, l = folder / "shots", 0.035, 1.9  # noqa: E741
+    shots.mkdir(parents=True, exist_ok=True)
+    grid = PixelGrid.centred(300, 300, pixel)
+    x, y = np.meshgrid(grid.x, grid.y)
+    speckle = Speckle(SpeckleSpec(seed=2), grid.shape)
+    for k in range(count + 1):
+        X, Y = x / (1.0 - 0.04 * k / count), y / (1.0 + 0.02 * k / count)
+        inside = (np.abs(X) < 2.35 * l) & (np.abs(Y) < 2.35 * l)
+        near = np.hypot(X - l * np.rint(X / l), Y - l * np.rint(Y / l))
+        inside &= (near > 0.7) | (np.abs(X) > 2.5 * l) | (np.abs(Y) > 2.5 * l)
+        noise = 2.0 * np.random.default_rng(k).normal(size=grid.shape)
+        levels = np.where(inside, 60.0 + 180.0 * speckle(*grid.to_px(X, Y)), 20.0) + noise
+        name = f"shots/f{k}.tif" if k else "reference.tif"
+        write_image(folder / name, np.clip(np.rint(levels), 0, 255).astype(np.uint8))
+    path = folder / "experiment.toml"
+    path.write_text(
+        '[images]\nreference = "reference.tif"\ndeformed = ["shots"]\n'
+        f"[scale]\npixel_size = {pixel}\n[specimen]\ncell_size = {l}\n"
+        "[correlation]\nv0_degree = 2\nv_degree = 1\n"
+    )
+    return path
+
+
+def peak(command: str, count: int, folder: Path) -> float:
+    """MB that harvesting or measuring so many photographs takes at most."""
+    experiment = small_photographs(folder, count)
+    what = [str(experiment)]
+    if command == "measure":
+        what = [str(folder / "reference.tif"), str(folder / "shots")]
+    script = (
+        "import resource, sys; from modeharvest.cli.root import main\n"
+        "try: main()\n"
+        "finally: print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script, command, *what, "--out", str(folder / "out")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return float(ran.stdout.split()[-1])
+
+
+def draw(rows: list[dict[str, float]], path: Path) -> None:
+    """Draw what the page shows of a test."""
+    test = WatchedTest(rows)
+    last = test.predictions[-1]
+    assert last
+    parts = []
+    with style.style():
+        for drawn in (draw_amplitude(test, last), draw_growth(test, last)):
+            memory = io.BytesIO()
+            drawn.savefig(memory, dpi=110, facecolor="white")
+            parts.append(Image.open(memory))
+    whole = Image.new("RGB", (sum(part.width for part in parts), parts[0].height))
+    for k, part in enumerate(parts):
+        whole.paste(part, (k * parts[0].width, 0))
+    whole.quantize(64).save(path, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--memory", nargs="+", metavar=("COMMAND", "COUNT"))
+    parser.add_argument("--time", action="store_true")
+    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--scatter", type=float, default=0.01)
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()) / "watch")
+    given = parser.parse_args()
+    if given.memory:
+        command, *counts = given.memory
+        for count in map(int, counts):
+            with tempfile.TemporaryDirectory() as folder:
+                begin = time.perf_counter()
+                most = peak(command, count, Path(folder))
+                took = (time.perf_counter() - begin) / count
+                print(
+                    f"{command}, {count} photographs: {most:.0f} MB, {took:.1f} s each", flush=True
+                )
+        return
+    given.out.mkdir(exist_ok=True)
+    perfect = solved(Experiment(strains=(0.1,)), given.out / "perfect.h5")
+    critical = perfect.info["critical"]["strain"]
+    print(f"critical strain of the perfect specimen {100 * critical:.3f} %")
+    strains = tuple(np.round(critical * SHARES, 4))
+    if given.time:
+        part = Experiment(strains=strains[::4], imperfection=Imperfection(0.01, 0.01, 1))
+        path = photographed(solved(part, given.out / "time.h5"), given.out / "time", 0.0107)
+        measuring = QuickMeasurement(PhotographCase.read(path))
+        print(f"{measuring.reference.image.size / 1e6:.2f} Mpx")
+        for shot in sorted((path.parent / "shots").iterdir()):
+            begin = time.process_time()
+            row = measuring.measure(shot)
+            busy = time.process_time() - begin
+            print(f"{row['name']}: {row['seconds']:.2f} s, {busy:.2f} s of processors, strain "
+                  f"{100 * row['strain']:.2f} %", flush=True)  # fmt: skip
+        return
+    found = []
+    for seed in range(1, given.seeds + 1):
+        scatter = Imperfection(given.scatter, given.scatter, seed)
+        name = f"{given.scatter:g}_{seed}"
+        kept = given.out / f"{name}.json"  # a second run has them at once
+        if not kept.is_file():
+            experiment = Experiment(strains=strains, imperfection=scatter)
+            solution = solved(experiment, given.out / f"{name}.h5")
+            rows = watched(photographed(solution, given.out / name, 0.02))
+            kept.write_text(json.dumps(rows))
+        rows = json.loads(kept.read_text())
+        if seed == 1 and given.picture is not None:
+            draw(rows[: int((SHARES < 0.71).sum())], given.picture)
+        columns = [[row[key] for row in rows] for key in ("strain", "amplitude_mm", "sd_mm")]
+        predictions = follow_growth(*columns)
+        # What is measured is the strain of the cellular part, without the bulk at its edges.
+        there = float(np.polyval(np.polyfit(strains, columns[0], 2), critical))
+        line = [f"seed {seed}: {100 * there:.2f} %;"]
+        for share in ASKED:
+            k = int(np.flatnonzero(share + 1e-6 >= SHARES)[-1])
+            at = predictions[k]
+            if at is None:
+                line.append(f"{share:.0%} –")
+                continue
+            found.append((share, at.critical / there, at.low <= there <= at.high))
+            line.append(f"{share:.0%} {100 * at.critical:.2f} ({at.interval})")
+        print("  ".join(line), flush=True)
+    for share in ASKED:
+        ratio = np.array([r for s, r, _ in found if s == share])
+        covered = [h for s, _, h in found if s == share]
+        rms, most = np.sqrt(np.mean((ratio - 1) ** 2)), np.abs(ratio - 1).max()
+        print(
+            f"at {share:.0%}: median {100 * (np.median(ratio) - 1):+.1f} %, rms {100 * rms:.1f} %, "
+            f"largest {100 * most:.1f} %; intervals hold in {sum(covered)} of {len(covered)}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Displacement fields written as other DIC codes write them, to be read back by ``read_field``.
+
+Numbers are in the convention of the code: see ``formats``. Standard deviations are written where
+the code has a place for them, as one number for both components.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import savemat
+
+from modeharvest.idic.local.field import LocalField, write_field
+from modeharvest.idic.local.formats import layouts
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic
+
+_OFF_PX = 1e-3
+"""From whole pixels, where a code knows no others."""
+Columns = dict[str, FloatArray]
+FORMATS = {"ncorr": ".mat", "vic2d": ".csv", "davis": ".txt", "dice": ".txt", "matchid": ".csv",
+           "gom": ".csv", "pyvale": ".csv", "csv": ".csv", "mat": ".mat", "npz": ".npz"
+           }  # fmt: skip
+"""Suffix of each format, by the names that commands know."""
+
+
+def export_field(
+    path: Path | str, field: LocalField, form: str, grid: PixelGrid, unit: str = "mm"
+) -> Path:
+    """Write a field as one of :data:`FORMATS`; returns the file, whose suffix is the format's.
+
+    InputError for an unknown format, for points off whole pixels where the code has grids, and for
+    a code that writes millimetres where the size of a pixel isn't known.
+
+    grid : the pixels of the reference image.
+    unit : "mm", or "px" where that is what the field's lengths are.
+    """
+    if form not in FORMATS:
+        raise InputError(f"expected a format among {', '.join(FORMATS)}, got {form!r}")
+    if unit == "px" and form in ("matchid", "gom", "csv", "npz", "mat"):
+        raise InputError(f"expected the size of a pixel for {form}, which is in mm; give it")
+    path = Path(path).with_suffix(FORMATS[form])
+    if form in (texts := layouts()["written"]):
+        _write_text(path, texts[form], _numbers(field, grid))
+    elif form in ("csv", "npz"):
+        write_field(path, field)
+    elif form == "davis":
+        _write_davis(path, *_lattice(path, field, grid))
+    else:
+        content = _of_matlab(field) if form == "mat" else _of_ncorr(path, field, grid, unit)
+        with atomic(path) as part:
+            savemat(part, content, appendmat=False, do_compression=True, oned_as="column")
+    return path
+
+
+def _numbers(field: LocalField, grid: PixelGrid) -> Columns:
+    """Columns of all points: of those that failed, displacements are NaN; those with 0 are 0."""
+    (row, col), size = grid.to_px(field.x, field.y), grid.pixel_size
+    u, v = np.where(field.good, field.u.T, np.nan) / size
+    sd = np.zeros(len(u)) if field.sd is None else np.sqrt(np.mean(field.sd**2, axis=1)) / size
+    own = {
+        "col": col, "row": row, "u": u, "v": -v, "size": np.hypot(u, v), "zero": 0.0 * col,
+        "number": np.arange(1.0, len(u) + 1.0), "good": field.good.astype(np.float64),
+        "sigma": np.where(field.good, np.nan_to_num(sd), -1.0), "x": field.x, "y": field.y,
+        "status": np.where(field.good, 4.0, 11.0), "v_up_mm": size * v,
+    }  # fmt: skip
+    both = ("col", "row", "u", "v")
+    own |= {f"{name}_mm": size * own[name] for name in both}
+    return own | {f"{name}0": np.nan_to_num(own[name]) for name in both}
+
+
+def _write_text(path: Path, layout: Mapping[str, Any], numbers: Columns) -> None:
+    """Nothing stands for NaN; the decimal sign is a comma between semicolons."""
+    separator, heads = layout["separator"], layout["columns"]
+    decimal = "," if separator == ";" else "."
+    with atomic(path) as part, part.open("w", encoding="utf-8") as file:
+        file.write(separator.join(heads) + "\n")
+        for row in np.column_stack([numbers[of] for of in heads.values()]):
+            line = separator.join("" if np.isnan(v) else f"{v:.12g}" for v in row)
+            file.write(line.replace(".", decimal) + "\n")
+
+
+def _lattice(path: Path, field: LocalField, grid: PixelGrid) -> tuple[int, FloatArray]:
+    """Distance of the points [px], and (2, rows, cols) u and v (down) [px], 0 where there are none.
+
+    The first point of the grids is the first pixel, so that the others are whole distances off.
+    """
+    numbers = _numbers(field, grid)
+    places = np.stack([numbers["row"], numbers["col"]])
+    whole = np.rint(places).astype(np.int64)
+    off, step = float(np.abs(places - whole).max()), int(np.gcd.reduce(whole.ravel())) or 1
+    if off > _OFF_PX or whole.min() < 0:
+        raise InputError(
+            f"{path}: expected points at whole pixels of the image for a code that writes grids, "
+            f"got them up to {off:.2g} px off; write VIC-2D's or DICe's"
+        )
+    maps = np.zeros((2, *(1 + whole.max(axis=1) // step)))
+    maps[:, *(whole // step)] = numbers["u0"], numbers["v0"]
+    return step, maps
+
+
+def _write_davis(path: Path, step: int, maps: FloatArray) -> None:
+    _, rows, cols = maps.shape
+    y, x = step * np.mgrid[:rows, :cols]
+    table = np.stack([x, y, *maps], axis=-1).reshape(-1, 4)
+    head = f'#DaVis 8.4.0 2D-vector {step} {rows} {cols} "" "pixel" "" "pixel" "displacement" '
+    with atomic(path) as part:
+        np.savetxt(part, table, "%.12g", "\t", header=head + '"pixel"', comments="")
+
+
+def _of_ncorr(path: Path, field: LocalField, grid: PixelGrid, unit: str) -> dict[str, object]:
+    step, maps = _lattice(path, field, grid)
+    frame = {f"plot_{name}_dic": values for name, values in zip("uv", maps, strict=True)}
+    frame |= {f"plot_{name}_ref_formatted": grid.pixel_size * values
+              for name, values in zip("uv", maps, strict=True)}  # fmt: skip
+    info = {"pixtounits": grid.pixel_size, "units": unit, "spacing": step - 1, "type": "regular"}
+    return {"data_dic_save": {"displacements": frame, "dispinfo": info}}
+
+
+def _of_matlab(field: LocalField) -> Columns:
+    """What modeharvest writes [mm], under names that are variables of MATLAB."""
+    sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
+    names = ("x_mm", "y_up_mm", "u_mm", "v_up_mm", "sd_u_mm", "sd_v_mm", "valid")
+    arrays = (field.x, field.y, *field.u.T, *sd.T, field.good.astype(np.float64))
+    return dict(zip(names, arrays, strict=True))

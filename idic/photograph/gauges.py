@@ -1,0 +1,212 @@
+"""Gauges in measured displacements: at points, along lines (extensometers), over areas.
+
+A gauge's variance is what each root of all nodes' covariance (``NodalResult.roots``) changes in its
+reading, squared and summed: what neighbours have in common counts as it does in a mean.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from skimage.measure import points_in_poly
+
+from modeharvest.idic.finite_element.fields import field_of, nodal_gradient
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import reading, write_csv
+from modeharvest.util.typed import made
+
+_MOST_POINTS = 2000
+"""Of an area."""
+_ALONG_PX = 2.0
+"""Between points of a line."""
+_DEGREES = {"rotation": "deg", "turn": "deg"}
+Position = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """A gauge: a ``point``, a ``line`` between two, or a ``polygon``, one of the three.
+
+    Positions are in the unit of the result, x right and y up from its origin (of ``measure``: the
+    middle of the image); with ``pixels`` they are [column, row] as an image viewer shows, from 0.
+    """
+
+    name: str
+    point: Position | None = None
+    line: tuple[Position, Position] | None = None
+    polygon: tuple[Position, ...] | None = None
+    pixels: bool = False
+
+    def __post_init__(self) -> None:
+        names, what = ("point", "line", "polygon"), f"gauge {self.name!r}: expected"
+        given = [name for name in names if getattr(self, name) is not None]
+        if not self.name.strip():
+            raise InputError("a gauge: expected a name, got an empty one")
+        if len(given) != 1:
+            got = " and ".join(given) or "none"
+            raise InputError(f"{what} one of {', '.join(names)}, got {got}")
+        if self.polygon is not None and len(self.polygon) < 3:
+            raise InputError(f"{what} 3 corners or more, got {len(self.polygon)}")
+        if self.line is not None and self.line[0] == self.line[1]:
+            raise InputError(f"{what} a line of some length, got none")
+
+    def corners(self, grid: PixelGrid) -> FloatArray:
+        """(k, 2) its point, ends or corners in the result's frame and unit."""
+        given = np.array(self.line or self.polygon or [self.point], dtype=np.float64)
+        return np.stack(grid.to_mm(given[:, 1], given[:, 0]), axis=1) if self.pixels else given
+
+
+class GaugeReading(NamedTuple):
+    """A value with its standard deviation."""
+
+    value: float
+    sd: float
+    unit: str
+
+
+Readings = dict[str, GaugeReading]
+"""By the names of what was read."""
+
+
+def read_gauges(path: Path | str) -> tuple[Gauge, ...]:
+    """Gauges of a TOML file's tables [[gauges]]; InputError if there are none, or one is wrong."""
+    with reading(path, "gauges (TOML)", "write [[gauges]] with name and point, line or polygon"):
+        tables = tomllib.loads(Path(path).read_text("utf-8")).get("gauges")
+    if not tables:
+        raise InputError(f"{path}: expected [[gauges]], got none")
+    try:
+        gauges = tuple(made(Gauge, table) for table in tables)
+    except InputError as error:
+        raise InputError(f"{path}: gauges: {error}") from error
+    names = sorted(gauge.name for gauge in gauges)
+    if twice := next((a for a, b in pairwise(names) if a == b), None):
+        raise InputError(f"{path}: expected gauges of different names, got {twice!r} again")
+    return gauges
+
+
+def read_at(gauge: Gauge, result: NodalResult, unit: str = "mm") -> Readings:
+    """What a gauge reads in a displacement, with standard deviations (NaN where it has no roots).
+
+    A point, and the mean over an area's material: u, v, logarithmic strains, rotation
+    (counter-clockwise), principal stretches, J. A line: its length, the engineering strain l/L - 1
+    and the logarithmic one of its ends, its turn, and the mean of the stretch along it less 1.
+    InputError if a point or an end is beside the material, or nothing of an area is on it.
+    """
+    points, (u, *du), (F, *dF) = _at(gauge, result)
+    of, names = (_of_line, _LINE) if gauge.line else (_mean, _MEAN)
+    values, units = of(points, u, F), {"u": unit, "v": unit, "length": unit} | _DEGREES
+    changes = [of(points, u + v, F + G) - of(points, u - v, F - G)
+               for v, G in zip(du, dF, strict=True)]  # fmt: skip
+    sd = 0.5 * np.linalg.norm(changes, axis=0) if changes else np.full(len(values), np.nan)
+    read = zip(names, values, sd, strict=True)
+    return {name: GaugeReading(float(v), float(d), units.get(name, "-")) for name, v, d in read}
+
+
+def along(gauge: Gauge, result: NodalResult) -> FloatArray:
+    """(k, 6) of a line: distance from its first end, x, y, u, v, stretch along the line less 1."""
+    points, (u, *_), (F, *_) = _at(gauge, result)
+    s = np.linalg.norm(points - points[0], axis=1)
+    return np.column_stack([s, points, u, _stretch(points, F) - 1.0])
+
+
+_MEAN = ("u", "v", "strain_xx", "strain_yy", "strain_xy", "rotation", "stretch_1", "stretch_2", "J")
+_LINE = ("length", "engineering_strain", "true_strain", "strain_along", "turn")
+
+
+def _mean(points: FloatArray, u: FloatArray, F: FloatArray) -> FloatArray:
+    strain = field_of("logarithmic", F).mean(axis=0)
+    others = [field_of(name, F).mean() for name in ("rotation", "stretch_1", "stretch_2", "J")]
+    return np.array([*u.mean(axis=0), strain[0, 0], strain[1, 1], strain[0, 1], *others])
+
+
+def _of_line(points: FloatArray, u: FloatArray, F: FloatArray) -> FloatArray:
+    before = points[-1] - points[0]
+    length, now = np.linalg.norm(before), before + u[-1] - u[0]
+    strain = np.linalg.norm(now) / length - 1.0
+    turn = np.degrees(np.arctan2(before[0] * now[1] - before[1] * now[0], before @ now))
+    mean = np.nanmean(_stretch(points, F)) - 1.0
+    return np.array([length * (1.0 + strain), strain, np.log1p(strain), mean, turn])
+
+
+def _stretch(points: FloatArray, F: FloatArray) -> FloatArray:
+    """(p,) of a line at its points."""
+    before = points[-1] - points[0]
+    return np.asarray(np.linalg.norm(F @ (before / np.linalg.norm(before)), axis=1))
+
+
+def _at(gauge: Gauge, result: NodalResult) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(p, 2) points, (1 + k, p, 2) u and (1 + k, p, 2, 2) F there: the result's, then its roots'.
+
+    Of a line its ends are the first and the last point.
+    """
+    corners, pixel = gauge.corners(result.grid), result.grid.pixel_size
+    if gauge.line:
+        length = float(np.linalg.norm(corners[1] - corners[0]))
+        share = np.linspace(0.0, 1.0, max(3, 1 + round(length / (_ALONG_PX * pixel))))
+        points = corners[0] + share[:, None] * (corners[1] - corners[0])
+    elif gauge.polygon:
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        step = max(pixel, float(np.sqrt(np.prod(high - low) / _MOST_POINTS)))
+        x, y = (np.arange(a + 0.5 * step, b, step) for a, b in zip(low, high, strict=True))
+        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        points = points[points_in_poly(points, corners)]  # type: ignore[no-untyped-call]
+    else:
+        points = corners
+    found = result.at(points, _nodal(result)) if len(points) else np.zeros((0, 2, 3, 1))
+    on: BoolArray = np.asarray(np.isfinite(found).all(axis=(1, 2, 3)))
+    if gauge.polygon:
+        points, found, on = points[on], found[on], on[on]
+    if not (on.any() and on[0] and on[-1]):
+        (left, bottom), (right, top) = np.quantile(result.mesh.nodes, [0, 1], axis=0)
+        raise InputError(
+            f"gauge {gauge.name!r}: expected it on the material, got it beside; the material lies "
+            f"in x = {left:.4g} to {right:.4g} and y = {bottom:.4g} to {top:.4g}, y up"
+        )
+    F = np.moveaxis(found[..., 1:, :], -1, 0)
+    F = np.concatenate([F[:1] + np.eye(2), F[1:]])
+    return points, np.moveaxis(found[..., 0, :], -1, 0), F
+
+
+@lru_cache(maxsize=1)
+def _nodal(result: NodalResult) -> FloatArray:
+    """(n, 2, 3, 1 + k) displacement and its roots at the nodes, each with its gradient behind."""
+    u = result.displacement[..., None]
+    u = u if result.roots is None else np.concatenate([u, result.roots], axis=2)
+    slopes = nodal_gradient(result.mesh, u.reshape(len(u), -1)).reshape(*u.shape, 2)
+    return np.moveaxis(np.concatenate([u[..., None], slopes], axis=-1), 2, -1)
+
+
+def write_gauges(
+    folder: Path, gauges: Sequence[Gauge], results: Iterable[tuple[str, NodalResult]], unit: str
+) -> dict[str, dict[str, Readings]]:
+    """Read gauges in every image's result; leaves gauges.csv and gauges_along.csv, of lines.
+
+    Returns what each gauge reads by its name, by the images' names.
+    """
+    readings, lines = dict[str, dict[str, Readings]](), list[tuple[Any, ...]]()
+    for name, result in results:
+        readings[name] = {gauge.name: read_at(gauge, result, unit) for gauge in gauges}
+        lines += [(name, gauge.name, *values) for gauge in gauges if gauge.line
+                  for values in along(gauge, result)]  # fmt: skip
+    rows = [
+        {"image": image} | {f"{name} {of}{what} [{r.unit}]": number
+         for name, found in own.items() for what, r in found.items()
+         for of, number in zip(("", "sd "), r[:2], strict=True)}
+        for image, own in readings.items()
+    ]  # fmt: skip
+    write_csv(folder / "gauges.csv", rows[0], (row.values() for row in rows))
+    if lines:
+        of_lengths = (f"{name} [{unit}]" for name in ("s", "x", "y up", "u", "v up"))
+        heads = ("image", "gauge", *of_lengths, "strain_along [-]")
+        write_csv(folder / "gauges_along.csv", heads, lines)
+    return readings

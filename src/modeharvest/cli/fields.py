@@ -1,0 +1,103 @@
+"""Commands for fields that are measured already: exported, read by gauges, animated."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from modeharvest.cli.messages import bars, folder_option
+from modeharvest.util.errors import InputError
+
+Run = Annotated[Path, typer.Argument(metavar="DIR", help="Of a run that has measured, or a file.")]
+_FORMATS = (
+    "ncorr, vic2d, davis, dice, matchid, gom, pyvale, csv, mat, npz; of a run hdf5, vtu, tiff"
+)
+
+
+def export(
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="A run's folder, or a field of any DIC code.")
+    ],
+    form: Annotated[str, typer.Option("--as", help=_FORMATS, metavar="FORMAT")],
+    out: Annotated[Path, folder_option("--out", "Folder for the files.")],
+    step: Annotated[int, typer.Option(help="Pixels between points of codes.", min=1)] = 5,
+    image: Annotated[
+        Path | None, typer.Option(help="The reference, for another code's field in pixels.")
+    ] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="Of that image, in mm.")] = None,
+) -> None:
+    """Write measured displacements as another DIC code would, or with all fields that follow.
+
+    Other codes' fields are recognised and converted; what they were read as is said.
+    """
+    from modeharvest.idic.local.export import export_field
+    from modeharvest.idic.local.field import read_field
+    from modeharvest.idic.photograph.finished import FinishedRun
+    from modeharvest.imaging.grid import PixelGrid
+    from modeharvest.imaging.photographs.files import read_image
+    from modeharvest.util.files import make_folder
+
+    if source.is_dir() or source.suffix == ".h5":
+        written = FinishedRun.read(source).export(form, out, step)
+    else:
+        rows, cols = (1, 1) if image is None else read_image(image).shape
+        grid = PixelGrid.centred(rows, cols, pixel_size or 1.0)
+        field = read_field(source, None if image is None else grid)
+        make_folder(out)
+        unit = "px" if image and not pixel_size else "mm"
+        written = [export_field(out / source.stem, field, form, grid, unit)]
+        print(field.read_as)
+    print(f"{len(written)} files in {out}, the first is {written[0].name}")
+
+
+def gauges(
+    run: Run,
+    file: Annotated[Path, typer.Argument(metavar="GAUGES.toml", help="Tables [[gauges]].")],
+) -> None:
+    """Read gauges in every image of a run: DIR/gauges.csv, gauges_along.csv, gauges.pdf."""
+    from modeharvest.idic.photograph.finished import FinishedRun
+    from modeharvest.idic.photograph.gauges import read_gauges, write_gauges
+    from modeharvest.report.figures.on_photographs import draw_gauge, write_pdf
+
+    finished, wanted = FinishedRun.read(run), read_gauges(file)
+    out = run if run.is_dir() else run.parent
+    each = ((name, finished.result(name)) for name in finished.files)
+    read = write_gauges(out, wanted, each, finished.unit)
+    last, rows = [*read][-1], [["gauge", "reads", "value", "standard deviation"]]
+    rows += [[name, what.replace("_", " "), f"{value:.6g} {unit}", f"± {sd:.2g}"]
+             for name, found in read[last].items()
+             for what, (value, sd, unit) in found.items()]  # fmt: skip
+    pages = [partial(draw_gauge, g.name, [r[g.name] for r in read.values()]) for g in wanted]
+    write_pdf(out / "gauges.pdf", f"Gauges of {out.name} in {last}", rows, pages)
+    print("\n".join("  ".join(row) for row in rows))
+    print(f"{len(read)} images: {out / 'gauges.csv'}, gauges.pdf")
+
+
+def animate(
+    run: Run,
+    field: Annotated[
+        list[str] | None,
+        typer.Option(help="u, v, logarithmic_xx, rotation, stretch_1, ...; u by default."),
+    ] = None,
+    form: Annotated[str, typer.Option("--as", help="gif, mp4, or pdf of all fields.")] = "gif",
+    photograph: Annotated[
+        list[Path] | None, typer.Option(help="Of each image in turn, where they were moved.")
+    ] = None,
+) -> None:
+    """Draw fields on the deformed photographs of a run: DIR/FIELD.gif, FIELD.mp4, fields.pdf."""
+    from modeharvest.idic.photograph.finished import FinishedRun
+    from modeharvest.report.figures import on_photographs
+
+    if form not in ("gif", "mp4", "pdf"):
+        raise InputError(f"expected --as gif, mp4 or pdf, got {form!r}")
+    finished, out = FinishedRun.read(run, photograph or ()), run if run.is_dir() else run.parent
+    names = field or (on_photographs.PRINTED if form == "pdf" else ("u",))
+    with bars() as progress:
+        if form == "pdf":
+            on_photographs.print_fields(finished, names, out / "fields.pdf", progress)
+        for name in names if form != "pdf" else ():
+            on_photographs.animate(finished, name, out / f"{name}.{form}", progress)
+    print(f"{form} in {out}")

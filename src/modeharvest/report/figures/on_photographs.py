@@ -1,0 +1,151 @@
+"""Measured fields drawn on photographs, animated, and printed to PDF; what gauges have read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.photograph.finished import FinishedRun
+from modeharvest.idic.photograph.gauges import Readings
+from modeharvest.report.figures import maps, style
+from modeharvest.report.figures.boundaries import MeshBoundary
+from modeharvest.util.arrays import FloatArray, FloatImage
+from modeharvest.util.errors import MissingDependencyError
+from modeharvest.util.files import atomic
+from modeharvest.util.progress import Progress, counted, silent
+
+PRINTED = ("u", "v", "logarithmic_xx", "logarithmic_yy", "logarithmic_xy", "rotation", "stretch_1")
+_WIDTH, _CELLS, _DPI, _MS, _MOST_ROWS = 5.6, 700, 120, 400, 60
+_OPAQUE, _KEPT = 0.65, 0.995  # over a photograph; share of values inside the colours' ends
+Draw = Callable[[], Figure]
+
+
+def draw_on_photograph(
+    result: NodalResult, values: FloatArray, scale: maps.ColourScale,
+    picture: FloatImage | None, title: str = "", unit: str = "mm",
+) -> Figure:  # fmt: skip
+    """Draw nodal values (n,) over the deformed photograph (rows, cols), from 0 to 1, or none."""
+    grid, moved = result.grid, result.displacement
+    factor = max(1, round(max(grid.shape) / _CELLS))
+    frame = maps.MapFrame(MeshBoundary.of(result.mesh), grid.binned(factor), factor, grid.extent)
+    drawn, axes = maps.empty_map(frame, _WIDTH, unit)
+    if picture is not None:
+        maps.show_grey(axes, frame, picture, None, grid)
+    maps.shaded(axes, result.mesh, moved, values, scale)
+    edge = maps.draw_edge(axes, frame.boundary.path(moved))
+    if picture is not None:  # once more above it: where triangles are clear their sides show twice
+        maps.show_grey(axes, frame, picture, None, grid)
+        axes.images[-1].set(alpha=1.0 - _OPAQUE, clip_path=edge, zorder=1.4)
+    axes.set(xlim=frame.limits[:2], ylim=frame.limits[2:])
+    axes.text(0.0, 1.02, title, transform=axes.transAxes, fontsize=8.5)
+    maps.colour_bar(axes, scale)
+    return drawn
+
+
+def frames(run: FinishedRun, name: str, progress: Progress = silent) -> list[Draw]:
+    """What draws a field's component on each photograph of a run, in the same colours."""
+    ends, unit = [], ""
+    for image in counted(tuple(run.files), progress, "colours"):
+        values, unit = run.component(image, name)
+        ends.append(np.nanquantile(values, [1.0 - _KEPT, _KEPT]))
+    low, high = float(np.min(ends)), float(np.max(ends))
+    scale = maps.ColourScale(style.SIZE, low, high, unit, "both")
+    if low < 0.0 < high:
+        scale = maps.ColourScale.signed(np.array([low, high]), unit)
+
+    def draw(image: str) -> Figure:
+        title, (values, _) = f"{name.replace('_', ' ')}, {image}", run.component(image, name)
+        picture = run.picture(image)
+        return draw_on_photograph(run.result(image), values, scale, picture, title, run.unit)
+
+    return [partial(draw, image) for image in run.files]
+
+
+def animate(run: FinishedRun, name: str, path: Path, progress: Progress = silent) -> None:
+    """Write a field on a run's photographs as GIF, or as MP4, which needs imageio-ffmpeg."""
+    drawn = map(_pixels, counted(frames(run, name, progress), progress, "draw"))
+    with atomic(path) as part:
+        if path.suffix == ".gif":
+            rest = (Image.fromarray(p).quantize(255, Image.Quantize.MAXCOVERAGE) for p in drawn)
+            next(rest).save(part, "gif", save_all=True, append_images=rest, duration=_MS, loop=0)
+            return
+        try:
+            from imageio_ffmpeg import write_frames
+        except ImportError as error:
+            how = "MP4 is written by imageio-ffmpeg: 'pip install imageio-ffmpeg', or take GIF"
+            raise MissingDependencyError(how) from error
+        stream: Any = None
+        for picture in drawn:
+            if stream is None:
+                size, to = picture.shape[1::-1], ["-f", "mp4"]
+                stream = write_frames(str(part), size, fps=1e3 / _MS, output_params=to)
+                stream.send(None)
+            stream.send(picture)
+        stream.close()
+
+
+def _pixels(draw: Draw) -> NDArray[np.uint8]:
+    """(rows, cols, 3) a figure's pixels, of blocks of 16 as video has them."""
+    with style.style():
+        drawn = draw()
+        drawn.set(dpi=_DPI, facecolor="white")
+        canvas: Any = FigureCanvasAgg(drawn)
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+        more = [(0, -n % 16) for n in pixels.shape[:2]]
+        return np.pad(pixels, [*more, (0, 0)], constant_values=255)
+
+
+def draw_gauge(name: str, readings: Sequence[Readings]) -> Figure:
+    """Draw the strains that a gauge has read in each image, with 95 % intervals."""
+    drawn = style.figure(3.6, 2.4)
+    axes = drawn.add_axes((0.22, 0.19, 0.75, 0.69))
+    number = np.arange(1, len(readings) + 1)
+    for k, what in enumerate(what for what in readings[0] if "strain" in what):
+        value, sd = np.array([r[what][:2] for r in readings], dtype=np.float64).T
+        axes.errorbar(number, value, 1.96 * np.nan_to_num(sd), color=style.colour(k), marker="o",
+                      ms=3, capsize=2, lw=1.2, label=what.replace("_", " "))  # fmt: skip
+    axes.set(xlabel="image", ylabel="strain [-]", xticks=number[:: 1 + len(number) // 10])
+    axes.set_title(name, fontsize=8.5, loc="left")
+    axes.legend()
+    return drawn
+
+
+def print_fields(
+    run: FinishedRun, names: Sequence[str], path: Path, progress: Progress = silent
+) -> None:
+    """Write fields on all photographs of a run as PDF, and how large they are."""
+    pages, rows = list[Draw](), [["image", "field", "5 %", "median", "95 %", "unit"]]
+    for name in names:
+        pages += frames(run, name, progress)
+        for image in run.files:
+            values, unit = run.component(image, name)
+            some = np.nanquantile(values, [0.05, 0.5, 0.95])
+            rows.append([image, name, *(f"{value:.4g}" for value in some), unit])
+    write_pdf(path, "Displacement and strain", rows[:_MOST_ROWS], pages)
+
+
+def write_pdf(
+    path: Path, title: str, numbers: Sequence[Sequence[str]], pages: Iterable[Draw]
+) -> None:
+    """Write a title, a table of numbers (its first row the heads), and figures, a page each."""
+    with atomic(path) as part, style.style(), PdfPages(part) as pdf:
+        cover = style.figure(8.27, 11.69)
+        axes = cover.add_axes((0.08, 0.05, 0.84, 0.88))
+        axes.set_axis_off()
+        axes.set_title(title, fontsize=14, loc="left")
+        table = axes.table([*map(list, numbers)], loc="upper left", cellLoc="left", edges="B")
+        table.auto_set_font_size(False)
+        table.set_fontsize(7.5)
+        for draw in (lambda: cover, *pages):
+            pdf.savefig(draw(), dpi=200, bbox_inches="tight", pad_inches=0.4)

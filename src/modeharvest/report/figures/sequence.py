@@ -1,0 +1,159 @@
+"""Figures of sequences: force over strain, growth of the pattern, the last photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from modeharvest.report.figures.curves import curve
+from modeharvest.report.figures.style import BLUE, GREY, MUTED, RED, figure, to_svg
+from modeharvest.report.model import Card
+from modeharvest.runs.photographs.watch import WatchedTest
+from modeharvest.util.arrays import FloatArray, FloatImage
+from modeharvest.util.files import atomic
+from modeharvest.validation.growth import Prediction
+
+
+def force_cards(frames: Sequence[Mapping[str, Any]], key: str, what: str) -> list[Card]:
+    """Force over strain, if a machine's log gives forces of two photographs at least.
+
+    ``frames``: of ``summary.json``; ``key`` of their strain, which is called ``what``.
+    """
+    known = [frame for frame in frames if frame.get("force_N") is not None]
+    if len(known) < 2:
+        return []
+    strain, force = (np.array([f[k] for f in known], np.float64) for k in (key, "force_N"))
+    return [Card.captioned("timeline-force", partial(draw_force, strain, force, what))]
+
+
+def draw_force(strain: FloatArray, force: FloatArray, what: str) -> Figure:
+    """Draw force [N] over strain [-], (n,) in the order of the test; ``what`` names the strain."""
+    drawn, axes = curve(f"{what} [%]", "force [N]")
+    axes.plot(100 * strain, force, "o-", color=BLUE, lw=1, ms=3.5 if strain.size < 60 else 1.5)
+    return drawn
+
+
+def write_watch_page(
+    path: Path, title: str, test: WatchedTest, photograph: FloatImage | None
+) -> None:
+    """Write the page of a test that is watched; it reloads itself until the test is over.
+
+    ``photograph``: the last one, (rows, cols) of any scale.
+    """
+    found = test.predictions
+    last = found[-1] if found else None
+    figures = {}
+    if photograph is not None:
+        figures["The last photograph"] = draw_photograph(photograph)
+    if test.rows:
+        figures["Amplitude of the pattern"] = draw_amplitude(test, last)
+    if last is not None:
+        figures["Growth: where the line ends, it buckles"] = draw_growth(test, last)
+    content = {
+        "title": escape(title or "A test, watched"),
+        "refresh": "" if test.conclusion else f'<meta http-equiv="refresh" content="{_RELOAD_S}">',
+        "lead": escape(watch_text(test)),
+        "figures": "".join(
+            f"<figure><figcaption>{name}</figcaption>{to_svg(drawn, f'f{k}', name)}</figure>"
+            for k, (name, drawn) in enumerate(figures.items())
+        ),
+        "skipped": "".join(
+            f"<li>{escape(row['name'])}: {escape(row['reason'])}</li>" for row in test.skipped[-20:]
+        ),
+    }
+    with atomic(path) as temporary:
+        temporary.write_text(_PAGE.substitute(content), "utf-8")
+
+
+def watch_text(test: WatchedTest) -> str:
+    """What is known of a test so far, in a sentence or two."""
+    if not test.rows:
+        return f"No photograph has been measured yet. {test.conclusion}"
+    last, found = test.rows[-1], test.predictions[-1]
+    text = (
+        f"{len(test.rows)} photographs, the last at a strain of {100 * last['strain']:.2f} %: "
+        f"pattern {last['pattern_px']:.2f} px rms. "
+    )
+    if found is None or not found.is_useful:
+        text += "The pattern's growth doesn't show yet when it buckles."
+    else:
+        text += (
+            f"It buckles at {100 * found.critical:.2f} % (95 %: {found.interval}), by growth up to "
+            f"{100 * found.largest:.2f} %."
+        )
+    return f"{text} {test.conclusion}"
+
+
+def draw_photograph(image: FloatImage) -> Figure:
+    """Draw a photograph, of few pixels, as dark and bright as it is."""
+    step = max(1, max(image.shape) // 500)
+    few = image[::step, ::step]
+    drawn = figure(4.2, 4.2 * few.shape[0] / few.shape[1])
+    axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    low, high = np.percentile(few, (0.5, 99.5))
+    axes.imshow(few, cmap=GREY, vmin=low, vmax=max(high, low + 1e-9), rasterized=True)
+    return drawn
+
+
+def _columns(test: WatchedTest) -> tuple[FloatArray, FloatArray, FloatArray]:
+    strain, amplitude, sd = (
+        np.array([row[key] for row in test.rows]) for key in ("strain", "amplitude_mm", "sd_mm")
+    )
+    sign = np.sign(amplitude[np.argmax(strain)]) or 1.0
+    return strain, sign * amplitude, sd
+
+
+def draw_amplitude(test: WatchedTest, found: Prediction | None) -> Figure:
+    """Draw v1's half wave over the strain, and the growth that was fitted to it."""
+    strain, amplitude, sd = _columns(test)
+    drawn, axes = curve("nominal strain [%]", "v₁, half wave [µm]")
+    axes.errorbar(100 * strain, 1e3 * amplitude, 2e3 * sd, fmt="o", color=BLUE, ms=3.5, lw=1)
+    if found is not None and found.is_useful:
+        p = np.linspace(0.0, 0.97 * found.critical, 200)
+        sign = np.sign(found.imperfection) or 1.0
+        grown = sign * (found.linear + found.imperfection / (found.critical - p)) * p
+        top = 1.3 * float(np.abs(amplitude).max())
+        axes.plot(100 * p, 1e3 * np.where(np.abs(grown) < top, grown, np.nan), color=MUTED, lw=1)
+        axes.axvspan(100 * found.low, 100 * found.high, color=RED, alpha=0.1, lw=0)
+        axes.axvline(100 * found.critical, color=RED, lw=1)
+    axes.set(xlim=(0, None))
+    return drawn
+
+
+def draw_growth(test: WatchedTest, found: Prediction) -> Figure:
+    """Draw strain over amplitude, less its linear part: a line that ends at the critical strain."""
+    strain, amplitude, sd = _columns(test)
+    sign = np.sign(found.imperfection) or 1.0
+    own = amplitude - sign * found.linear * strain
+    good = (strain > 0) & (own > 2 * sd) & (own > 0.1 * own.max(initial=0.0))
+    drawn, axes = curve("nominal strain [%]", "strain / (v₁ − c · strain) [1/mm]")
+    value = strain[good] / own[good]
+    axes.errorbar(100 * strain[good], value, 2 * value * sd[good] / own[good], fmt="o",
+                  color=BLUE, ms=3.5, lw=1)  # fmt: skip
+    ends = np.array([0.0, found.critical])
+    axes.plot(100 * ends, (found.critical - ends) / abs(found.imperfection), color=RED, lw=1)
+    if found.is_useful:
+        axes.axvspan(100 * found.low, 100 * found.high, color=RED, alpha=0.1, lw=0)
+    axes.set(ylim=(0, None), xlim=(0, None))
+    return drawn
+
+
+_RELOAD_S = 3
+_PAGE = Template("""<!doctype html>
+<html lang="en"><head><meta charset="utf-8">$refresh<title>$title · modeharvest</title>
+<style>
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; color: #16191d; }
+main { display: flex; flex-wrap: wrap; gap: 24px; }
+figure { margin: 0; flex: 1 1 360px; max-width: 560px; } figcaption { font-weight: 600; }
+svg { width: 100%; height: auto; } ul { color: #6a7078; font-size: .9rem; }
+</style></head>
+<body><h1>$title</h1><p>$lead</p><main>$figures</main><ul>$skipped</ul></body></html>
+""")

@@ -1,0 +1,288 @@
+"""A testing machine's log: its columns recognised, and joined to photographs by time.
+
+Text with one row a moment: separated by ``;``, ``,``, tabs or blanks; decimal points or commas;
+lines of any text before the heads, units in the heads or in a line below them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError, require_within
+from modeharvest.util.files import reading
+
+_NAMES = {
+    "time": r"^(test|total|elapsed|laufende?|pr[uü]f)?[ _-]*(time|zeit|temps|tiempo|tempo|t"
+    r"|datetime|timestamp|time ?stamp|zeitpunkt|date[ _/&-]*time|datum[ _/&-]*zeit|clock|uhrzeit)$",
+    "force": r"^(axial|standard|pr[uü]f|max\.?)?[ _-]*(force|load|kraft|last|fuerza|carga|forza"
+    r"|f|fz|load ?cell|kraftmessdose)([ _-]*\d)?$",
+    "crosshead": r"(crosshead|traverse|position|displacement|extension|stroke|standardweg|^weg$|"
+    r"traversenweg|d[eé]placement|desplazamiento|corsa|^disp$|^s$|^x$|compression)",
+    "date": r"^(date|datum|fecha|data)$",
+}
+"""Heads of columns without their units, lower case."""
+_UNITS = {
+    "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0, "": 1.0},
+    "force": {"n": 1.0, "kn": 1e3, "mn": 1e-3, "cn": 1e-2, "lbf": 4.4482216, "gf": 9.80665e-3,
+              "kgf": 9.80665, "": 1.0},
+    "crosshead": {"mm": 1.0, "µm": 1e-3, "um": 1e-3, "μm": 1e-3, "cm": 10.0, "m": 1e3, "in": 25.4,
+                  "\"": 25.4, "": 1.0},
+}  # fmt: skip
+"""What one of them is in s, N and mm. "MN" would be read as millinewtons: no laboratory has it."""
+_HEAD = re.compile(
+    r"^(.*?)[\s_]*(?:[\[(<]\s*([^\])>]*)\s*[\])>]|/\s*([a-zA-Zµμ]+)|\bin ([a-z]+))?$"
+)
+_EPOCH = 1e8
+"""Seconds from which on a number is a date, since 1970."""
+_ZONE = 900.0
+"""Time zones differ by multiples of this [s]."""
+
+
+@dataclass(frozen=True)
+class LogTable:
+    """Table ``[log]``: what the testing machine wrote down."""
+
+    file: str = ""
+    """Text file, relative to the TOML file; none if empty."""
+    time: str = ""
+    force: str = ""
+    crosshead: str = ""
+    """Heads of the columns, where they aren't recognised."""
+    offset_s: float | None = None
+    """What the log's clock shows minus the camera's [s]; found where it is a time zone."""
+    length: float | None = None
+    """Of what the crosshead compresses [mm], for nominal strains by it."""
+
+    def __post_init__(self) -> None:
+        others = (self.time, self.force, self.crosshead, self.offset_s, self.length)
+        if not self.file and any(others):
+            raise InputError("log: expected a file with its columns or offset, got none")
+        if self.length is not None:
+            require_within("log: expected a length [mm]", self.length, 0, above=True)
+
+
+@dataclass(frozen=True, eq=False)
+class MachineLog:
+    """What a testing machine wrote down."""
+
+    time: FloatArray
+    """(n,) ascending [s], since 1970 or since it began."""
+    force: FloatArray | None
+    """(n,) [N]."""
+    crosshead: FloatArray | None
+    """(n,) [mm]."""
+    text: tuple[str, ...]
+    """How it was read."""
+
+    @property
+    def is_dated(self) -> bool:
+        """Whether its times are of a calendar."""
+        return bool(self.time[0] > _EPOCH)
+
+    def at(self, times: FloatArray) -> dict[str, FloatArray]:
+        """Force [N] and crosshead [mm] at times (k,) by the log's clock; NaN beyond its ends."""
+        reach = float(np.median(np.diff(self.time)))
+        outside = (times < self.time[0] - reach) | (times > self.time[-1] + reach)
+        columns = {"force_N": self.force, "crosshead_mm": self.crosshead}
+        return {
+            name: np.where(outside, np.nan, np.interp(times, self.time, column))
+            for name, column in columns.items() if column is not None
+        }  # fmt: skip
+
+
+def read_log(path: Path, table: LogTable) -> MachineLog:
+    """Read a log; raises InputError if there is no column of time, or none of force or position."""
+    with reading(path, "a testing machine's log", "export it as text with a line of heads"):
+        above, body, decimal = _rows(_text(path))
+        heads, units = _heads(above, len(body[0]))
+        found = {
+            role: _column(role, heads, str(getattr(table, role, "")), path)
+            for role in ("time", "force", "crosshead", "date")
+        }
+        for roles in (("time",), ("force", "crosshead")):
+            if all(found[role] is None for role in roles):
+                raise InputError(
+                    f"{path}: expected a column of {' or '.join(roles)}, got "
+                    f"{', '.join(heads) or 'no heads'}; name it in [log], as in {roles[0]} = "
+                    '"..."'
+                )
+
+        def scale(role: str) -> float:
+            return _UNITS[role].get(units[found[role] or 0], 1.0)
+
+        def numbers(role: str) -> FloatArray | None:
+            i = found[role]
+            if i is None:
+                return None
+            return scale(role) * np.array([_number(row[i], decimal) for row in body])
+
+        at, date = found["time"] or 0, found["date"]
+        stamps = [row[at] if date is None else f"{row[date]} {row[at]}" for row in body]
+        time = _times(stamps, decimal, scale("time"))
+        columns = [numbers("force"), numbers("crosshead")]
+        keep = np.isfinite([time, *(c for c in columns if c is not None)]).all(axis=0)
+        if keep.sum() < 2:
+            raise InputError(f"{path}: expected two rows of numbers at least, got {keep.sum()}")
+    order = np.flatnonzero(keep)[np.argsort(time[keep], kind="stable")]
+    named = [f"{role} “{heads[i]}”" for role, i in found.items() if i is not None]
+    text = [f"{path.name}: {len(order)} rows; {', '.join(named)}."]
+    if back := int((np.diff(time[keep]) < 0).sum()):
+        text.append(f"{path.name}: time goes back {back} times; its rows were sorted.")
+    if lost := len(body) - len(order):
+        text.append(f"{path.name}: {lost} rows without numbers were left out.")
+    force, crosshead = (None if c is None else c[order] for c in columns)
+    return MachineLog(time[order], force, crosshead, tuple(text))
+
+
+def offset_between(
+    log: MachineLog, times: FloatArray, given: float | None
+) -> tuple[float, tuple[str, ...]]:
+    """What to add to the photographs' times (n,) [s] to get the log's, and how it was found.
+
+    Given; else none if both have dates and overlap; else the time zone by which they do; else the
+    log begins with the first photograph.
+    """
+    if given is not None:
+        return given, (f"The log's clock is taken to be {given:+g} s ahead of the photographs'.",)
+    dated = times[0] > _EPOCH
+    if dated and log.is_dated:
+        inside = _share(log, times)
+        if inside == 1.0:
+            return 0.0, ()
+        zones = _ZONE * np.arange(-56, 57)
+        shares = np.array([_share(log, times + zone) for zone in zones])
+        if shares.max() > inside:
+            best = zones[np.flatnonzero(shares == shares.max())]
+            zone = float(best[np.argmin(np.abs(best))])
+            return zone, (
+                f"The log's clock is {zone / 3600:+g} h ahead of the photographs', as in another "
+                "time zone; if that is wrong, give offset_s in [log].",
+            )
+        if inside > 0.0:
+            return 0.0, ()
+        return 0.0, ("No photograph was taken while the log was written; give offset_s in [log].",)
+    begin = float(log.time[0] - times[0]) if dated or log.is_dated else 0.0
+    if begin:
+        return begin, (
+            "The log is taken to begin with the first photograph, as only one of them has dates; "
+            "else give offset_s in [log].",
+        )
+    return 0.0, ()
+
+
+def _share(log: MachineLog, times: FloatArray) -> float:
+    return float(np.mean((times >= log.time[0] - 1.0) & (times <= log.time[-1] + 1.0)))
+
+
+# -- text --------------------------------------------------------------------------------
+
+
+def _text(path: Path) -> str:
+    raw = path.read_bytes()
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return raw.decode("utf-16")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
+def _rows(text: str) -> tuple[list[list[str]], list[list[str]], str]:
+    """Lines above the numbers; those with numbers, all as long; the sign for decimals.
+
+    Of all ways to read a text, the one by which most lines are numbers.
+    """
+    lines = [line for line in text.splitlines() if line.strip()]
+    best: tuple[list[list[str]], list[bool], str] = ([], [], ".")
+    for separator, decimal in ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."),
+                               (None, "."), (None, ",")):  # fmt: skip
+        rows = [[c.strip().strip('"') for c in line.split(separator)] for line in lines]
+        good = [len(row) > 1 and _is_numeric(row, decimal) for row in rows]
+        if sum(good) > sum(best[1]):
+            best = rows, good, decimal
+    rows, good, decimal = best
+    if sum(good) < 2:
+        raise InputError("expected rows of two numbers at least, got none")
+    count = Counter(len(row) for row, is_good in zip(rows, good, strict=True) if is_good)
+    length = count.most_common(1)[0][0]
+    first = next(i for i, row in enumerate(rows) if good[i] and len(row) == length)
+    return rows[:first], [row for row in rows[first:] if len(row) == length], decimal
+
+
+def _is_numeric(row: Sequence[str], decimal: str) -> bool:
+    """Whether one of the cells is a number, and no other is text but a date or a clock's."""
+    cells = [cell for cell in row if cell]
+    numbers = [np.isfinite(_number(cell, decimal)) for cell in cells]
+    return any(numbers) and all(
+        is_number or re.fullmatch(r"[\d.,:/ TZ+-]+( ?[AP]M)?", cell)
+        for is_number, cell in zip(numbers, cells, strict=True)
+    )
+
+
+def _number(cell: str, decimal: str) -> float:
+    """A number, with or without a sign for thousands; NaN for what is none."""
+    other = "," if decimal == "." else "."
+    text = cell.replace("\u202f", "").replace("'", "").replace("−", "-")
+    if decimal in text and text.find(other) < text.find(decimal):
+        text = text.replace(other, "")
+    try:
+        return float(text.replace(decimal, "."))
+    except ValueError:
+        return float("nan")
+
+
+def _heads(above: Sequence[Sequence[str]], count: int) -> tuple[list[str], list[str]]:
+    """Names and units of the columns, from the lines above the numbers."""
+    lines = [list(row) for row in above if len(row) == count][-2:]
+    if not lines:
+        return [], [""] * count
+    every = {unit for units in _UNITS.values() for unit in units}
+    below = [cell.strip("[]()").strip().lower() for cell in lines[-1]]
+    if len(lines) == 2 and all(cell in every for cell in below) and any(below):
+        return lines[0], below
+    split = [_HEAD.match(head) for head in lines[-1]]
+    return lines[-1], [
+        next((u for u in match.groups()[1:] if u), "").strip().lower() if match else ""
+        for match in split
+    ]
+
+
+def _column(role: str, heads: Sequence[str], given: str, path: Path) -> int | None:
+    if given:
+        names = [head.lower() for head in heads]
+        if given.lower() not in names:
+            raise InputError(
+                f"{path}: expected the column {given!r} of log.{role}, got {', '.join(heads)}"
+            )
+        return names.index(given.lower())
+    for i, head in enumerate(heads):
+        match = _HEAD.match(head)
+        base = (match[1] if match else head).strip().lower()
+        base = re.sub(r"[_\s]+(s|ms|min|h|n|kn|mm|um|m)$", "", base)
+        if re.search(_NAMES[role], base):
+            return i
+    return None
+
+
+def _times(stamps: Sequence[str], decimal: str, scale: float) -> FloatArray:
+    """(n,) [s] since 1970, or since the log or the day began; NaN where a row has none."""
+    import pandas as pd
+
+    numbers = np.array([_number(stamp, decimal) for stamp in stamps])
+    if np.isfinite(numbers).mean() > 0.5:
+        return np.asarray(scale * numbers)
+    # Clocks on the wall: of a zone that is written beside them nothing is taken.
+    plain = [re.sub(r"(:\d\d),", r"\1.", re.sub(r"(Z|[+-]\d\d:?\d\d)$", "", s)) for s in stamps]
+    times = pd.to_timedelta(pd.Series(plain), errors="coerce").dt.total_seconds()
+    if times.isna().mean() > 0.5:
+        iso = bool(re.match(r"\d{4}", plain[0]))
+        dates = pd.to_datetime(plain, format="mixed", dayfirst=not iso, errors="coerce")
+        times = pd.Series((dates - pd.Timestamp(0)).total_seconds())
+    return np.asarray(times, np.float64)

@@ -1,0 +1,306 @@
+"""Photographs measured while a test runs: the pattern's amplitude, and when it will buckle.
+
+::
+
+    watch.html    a page that reloads itself
+    watch.json    what was measured of every photograph, and the predictions; read after a stop
+
+Each photograph is correlated with a fixed mode on binned pixels, from where the last two point to.
+What the harvest of all photographs measures in the end is finer, and has error bars of its own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
+from modeharvest.idic.correlate import ASTRAY, correlate
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.motion import SLOW_DEGREE, first_motion, fit_unknowns
+from modeharvest.idic.modes import turning_family
+from modeharvest.idic.photograph.geometry import find_geometry, junction
+from modeharvest.idic.photograph.matching import matched_holes
+from modeharvest.idic.photograph.material import find_material, window_for
+from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
+from modeharvest.idic.solver.pyramid import FULL, Level, binned
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.photographs.files import read_mask, read_stored
+from modeharvest.imaging.photographs.photograph import (
+    Photograph,
+    read_photograph,
+    read_reference,
+    require_alike,
+)
+from modeharvest.imaging.photographs.sequence import PICTURES, natural
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, sha256_of, write_json
+from modeharvest.util.stages import digest, exclusive
+from modeharvest.util.typed import to_plain
+from modeharvest.validation.growth import Prediction, follow_growth, half_wave
+from modeharvest.validation.onset import mean_strain
+
+_PIXELS = 0.8e6
+"""That a photograph has once it is binned, about."""
+_DEGREES = AnsatzOptions(v0_degree=5, v_degree=4, gain_degree=0, offset_degree=0)
+_QUICK = CorrelationOptions(
+    levels=(Level(2, 1.0), FULL), order=3, gradient="deformed",
+    gauss_newton=GaussNewtonOptions(tolerance_px=1e-3),
+)  # fmt: skip
+_CAREFUL = replace(_QUICK, levels=(Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL))
+_SETTLED_S, _GIVEN_UP_S = 0.3, 10.0
+"""A file that hasn't changed for so long is whole; one that can't be read for so long won't be."""
+_POLL_S = 0.2
+_PAGE_S = 2.0
+"""Between two pages [s] while photographs are waiting."""
+
+
+@dataclass
+class WatchedTest:
+    """What is known so far of a test that is watched."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    """Of each photograph: ``name``, ``strain``, ``amplitude_mm``, ``sd_mm``, ``pattern_px`` (rms of
+    v1 phi1), ``seconds``."""
+    skipped: list[dict[str, str]] = field(default_factory=list)
+    """``name`` and ``reason``."""
+    conclusion: str = ""
+    """Why watching has ended; empty while it goes on."""
+
+    @classmethod
+    def read(cls, path: Path, key: str) -> WatchedTest:
+        """What a watch that was stopped has left; nothing if it was of another test."""
+        content = read_json(path) if path.is_file() else {}
+        if content.get("key") != key:
+            return cls()
+        return cls(list(content["frames"]), list(content["skipped"]))
+
+    @property
+    def predictions(self) -> list[Prediction | None]:
+        """The strain of buckling, predicted after each photograph."""
+        columns = ([row[key] for row in self.rows] for key in ("strain", "amplitude_mm", "sd_mm"))
+        strain, amplitude, sd = columns
+        return follow_growth(strain, amplitude, sd)
+
+    def summary(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        found = self.predictions
+        content = {"frames": self.rows, "skipped": self.skipped, "conclusion": self.conclusion}
+        plain: dict[str, Any] = to_plain({**content, "prediction": found[-1] if found else None})
+        return plain
+
+
+class QuickMeasurement:
+    """Measures photographs one after the other, with one fixed mode, on binned pixels."""
+
+    def __init__(self, case: PhotographCase) -> None:
+        self.case = case
+        images, table = case.images, case.specimen
+        self.reference = read_reference(case.base / images.reference)
+        self.factor = max(1, round(np.sqrt(self.reference.image.size / _PIXELS)))
+        self.grid = PixelGrid.centred(*self.reference.shape, case.scale.mm_per_px)
+        if table.material:
+            mask = read_mask(case.base / table.material)
+        else:
+            mask = self._material(self.reference.image)
+        self.geometry = find_geometry(mask, self.grid, table, case.base)
+        self._before: tuple[FloatArray, FloatArray] | None = None
+        self.thumbnail: FloatImage | None = None
+
+    def _material(self, image: FloatImage) -> BoolArray:
+        return find_material(image, window_for(self._cell_px)).mask
+
+    @property
+    def _cell_px(self) -> float:
+        return self.case.specimen.cell_size / self.case.scale.mm_per_px
+
+    @cached_property
+    def ansatz(self) -> Ansatz:
+        """Its mode is what the lattice of holes allows; InputError if it isn't square."""
+        geometry, cell = self.geometry, self.case.specimen.cell_size
+        lattice = geometry.lattice
+        if lattice is None or lattice.kind not in ("square", "rectangular"):
+            raise InputError(
+                "watch: expected holes on a square or rectangular lattice, whose pattern is known "
+                f"beforehand, got {'no' if lattice is None else lattice.kind} lattice; harvest "
+                "the photographs when there are some"
+            )
+        vectors = cell * np.eye(2) if geometry.lattice_mm is None else geometry.lattice_mm
+        family = turning_family(vectors, cell, junction(lattice, geometry.grid)).fixed()
+        part = geometry.region
+        return Ansatz.on(part.domain, [(family, part.cellular)], cell, _DEGREES)
+
+    def measure(self, path: Path) -> dict[str, Any]:
+        """Measure one photograph; its row of a test.
+
+        InputError if it can't be read, is of another kind, or doesn't match the reference.
+        """
+        begin = time.perf_counter()
+        frame = require_alike(self.reference, read_photograph(path))
+        image, mask, grid = self._few
+        pair = ImagePair(image, binned(frame.image, None, self.factor)[0], grid, mask)
+        result = self._from_the_last(pair)
+        if result is None or result.outcome in ASTRAY:
+            result = self._from_holes(frame, pair)
+        if result.outcome in ASTRAY:
+            raise InputError(f"{path}: it doesn't match the reference ({result.outcome.value})")
+        a = result.unknowns
+        self._before = (a, a if self._before is None else self._before[0])
+        cellular = self.geometry.region.cellular
+        amplitude, sd = half_wave(result, cellular)
+        few = self.grid.binned(max(1, round(self._cell_px / 8)))
+        inside = cellular.contains(*np.meshgrid(few.x, few.y))
+        pattern = result.fluctuation(0, few)[inside]
+        self.thumbnail = pair.deformed
+        return {
+            "name": path.name,
+            "strain": mean_strain(result, cellular)[0],
+            "amplitude_mm": amplitude,
+            "sd_mm": sd,
+            "pattern_px": float(np.sqrt(np.mean(pattern**2))) / self.grid.pixel_size,
+            "seconds": time.perf_counter() - begin,
+        }
+
+    @cached_property
+    def _few(self) -> tuple[FloatImage, BoolArray, PixelGrid]:
+        """The reference binned, whole pixels of its material, and their grid."""
+        image, _ = binned(self.reference.image, None, self.factor)
+        share = binned(self.reference.image, self.geometry.mask, self.factor)[1]
+        return image, share > 0.99, self.grid.binned(self.factor)
+
+    def _from_the_last(self, pair: ImagePair) -> Result | None:
+        """From where the last two photographs point to; None for the first."""
+        if self._before is None:
+            return None
+        now, before = self._before
+        result = correlate(pair, self.ansatz, guess=2.0 * now - before, options=_QUICK)
+        if result.outcome in ASTRAY:
+            result = correlate(pair, self.ansatz, guess=now, options=_CAREFUL)
+        return result
+
+    def _from_holes(self, frame: Photograph, pair: ImagePair) -> Result:
+        """From where the holes have gone, in whatever order photographs come."""
+        material = self._material(frame.image)
+        whole = ImagePair(
+            self.reference.image, frame.image, self.grid, self.geometry.mask, material
+        )
+        motion, _ = matched_holes(whole, self.geometry.lattice)
+        holes = None if motion is None else motion.in_mm(self.grid)
+        slow, _ = first_motion(self.geometry.region.domain, whole, holes)
+        few = self.grid.binned(max(1, round(self._cell_px / 4)))
+        x, y = (axis.ravel() for axis in np.meshgrid(few.x, few.y))
+        known = LocalField(x, y, slow(np.column_stack([x, y])), source="the holes")
+        ansatz = self.ansatz
+        start = fit_unknowns(ansatz, ansatz.initial_guess(), known, SLOW_DEGREE).coefficients
+        return correlate(pair, ansatz, guess=start, options=_CAREFUL)
+
+
+def watch(
+    case: str | Path, folder: Path, photographs: Path | None = None, *,
+    until_still: float | None = None, show: Callable[[str], None] = lambda line: None,
+) -> WatchedTest:  # fmt: skip
+    """Measure the photographs of a folder as they come; leaves a page that follows the test.
+
+    ``case``: a TOML file of a harvest, whose first ``deformed`` is the folder unless one is given;
+    ``until_still``: the seconds without a new photograph after which it ends, None for never;
+    ``show`` gets a line of each photograph. Ends as cleanly when interrupted. Raises InputError if
+    the case, or the reference, can't be used.
+    """
+    from modeharvest.report.figures.sequence import write_watch_page
+
+    found = PhotographCase.read(case)
+    where = found.base / found.images.deformed[0] if photographs is None else photographs
+    if not where.is_dir():
+        raise InputError(
+            f"expected a folder to watch, got {where}; name it after --watch, or make it"
+        )
+    with exclusive(folder):
+        measuring = QuickMeasurement(found)
+        key = digest([found.plain(), sha256_of(measuring.reference.path), str(where.absolute())])
+        test = WatchedTest.read(folder / "watch.json", key)
+        drawn = 0.0
+
+        def save() -> None:
+            write_json(folder / "watch.json", {"key": key, **test.summary()})
+            write_watch_page(folder / "watch.html", found.title, test, measuring.thumbnail)
+
+        try:
+            for path in arriving(where, measuring.reference.path, test, until_still):
+                try:
+                    test.rows.append(measuring.measure(path))
+                except InputError as error:
+                    test.skipped.append({"name": path.name, "reason": str(error)})
+                    show(f"{path.name}: not used: {error}")
+                    continue
+                show(_line(test))
+                if time.monotonic() - drawn > _PAGE_S:
+                    save()
+                    drawn = time.monotonic()
+            test.conclusion = f"No photograph came for {until_still:g} s."
+        except KeyboardInterrupt:
+            test.conclusion = "Watching was interrupted."
+        save()
+    return test
+
+
+def arriving(
+    folder: Path, reference: Path, test: WatchedTest, until_still: float | None
+) -> Iterator[Path]:
+    """The photographs of a folder, each once it is whole, those that are there already first.
+
+    Ends when none has come for ``until_still`` seconds.
+    """
+    seen = {row["name"] for row in test.rows} | {row["name"] for row in test.skipped}
+    seen.add(reference.name if reference.parent.absolute() == folder.absolute() else "")
+    still = time.monotonic()
+    while until_still is None or time.monotonic() - still < until_still:
+        names = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+        new = sorted((p for p in names if p.name not in seen and p.name[0] != "."), key=natural)
+        for path in new:
+            if _is_whole(path):
+                seen.add(path.name)
+                yield path
+                still = time.monotonic()
+        if not new:
+            time.sleep(_POLL_S)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file is written to its end: it doesn't grow, and can be read, or never will be."""
+    before = path.stat()
+    if time.time() - before.st_mtime < _SETTLED_S:
+        time.sleep(_SETTLED_S)
+        after = path.stat()
+        if (after.st_size, after.st_mtime) != (before.st_size, before.st_mtime):
+            return False
+    if time.time() - before.st_mtime > _GIVEN_UP_S:
+        return True
+    try:
+        read_stored(path)
+    except InputError:
+        time.sleep(_POLL_S)
+        return False
+    return True
+
+
+def _line(test: WatchedTest) -> str:
+    """A photograph's numbers, and the prediction after it."""
+    row, found = test.rows[-1], test.predictions[-1]
+    text = (
+        f"{row['name']}: {100 * row['strain']:.2f} %, pattern {row['pattern_px']:.2f} px, "
+        f"{row['seconds']:.1f} s"
+    )
+    if found is None or not found.is_useful:
+        return text
+    return f"{text}; buckling at {100 * found.critical:.2f} % ({found.interval})"

@@ -1,0 +1,139 @@
+"""What can be done with measured displacements later: gauges, exports, animations, PDF."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.io import loadmat
+from test_cli import called, error_line
+from test_gauges import GRID, MESH, affine, result
+
+from modeharvest.idic.finite_element.files import Given, write_result
+from modeharvest.idic.local.field import read_field
+from modeharvest.idic.photograph.finished import FinishedRun
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import write_json
+
+STRETCH = np.array([[1.02, 0.01], [-0.02, 0.97]])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "results").mkdir()
+    rng, images = np.random.default_rng(2), []
+    for k, name in enumerate(("b", "a")):  # not in the order of the alphabet
+        roots = 1e-4 * rng.normal(size=(len(MESH.nodes), 2, 4))
+        write_result(folder / f"results/{name}.h5", result((k + 1) * affine(STRETCH), roots))
+        write_image(folder / f"{name}.tif", rng.integers(0, 255, GRID.shape).astype(np.uint8))
+        images.append({"name": name, "file": str(folder / f"{name}.tif")})
+    write_json(folder / "summary.json", {"images": images})
+    (folder / "gauges.toml").write_text(
+        '[[gauges]]\nname = "L"\nline = [[-3, 0], [3, 0]]\n[[gauges]]\nname = "P"\npoint = [0, 1]\n'
+    )
+    return folder
+
+
+def test_a_run_is_opened_in_the_order_of_the_test(run: Path) -> None:
+    finished = FinishedRun.read(run)
+    assert [*finished.files] == ["b", "a"]
+    assert finished.unit == "mm"
+    assert [*finished.pictures] == ["b", "a"]
+    picture = finished.picture("a")
+    assert picture is not None
+    assert (picture.shape, bool(picture.max() <= 1.0)) == (GRID.shape, True)
+    only = FinishedRun.read(run / "results/a.h5")
+    assert ([*only.files], only.picture("a")) == (["a"], None)
+    with pytest.raises(InputError, match="a photograph for each of 2, got 1"):
+        FinishedRun.read(run, [run / "a.tif"])
+    with pytest.raises(InputError, match="expected a folder of 'measure'"):
+        FinishedRun.read(run / "a.tif")
+
+
+@pytest.mark.parametrize("form", ["ncorr", "vic2d", "davis", "dice", "matchid", "gom", "pyvale"])
+def test_a_run_written_for_another_code_is_read_as_it_was(
+    run: Path, tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert called(monkeypatch, "export", run, "--as", form, "--out", tmp_path, "--step", "4") == 0
+    (path,) = tmp_path.glob("a.*")
+    field = read_field(path, GRID)
+    assert field.convention
+    x, y, u = field.valid_points()
+    true = 2.0 * np.column_stack([x, y]) @ (STRETCH - np.eye(2)).T
+    np.testing.assert_allclose(u, true, atol=1e-9)
+    assert len(x) > 400
+
+
+def test_all_fields_go_into_every_format(run: Path, tmp_path: Path) -> None:
+    finished = FinishedRun.read(run)
+    for form, count in (("csv", 2), ("hdf5", 2), ("vtu", 2), ("mat", 2), ("tiff", 72)):
+        assert len(finished.export(form, tmp_path / form, 2)) == count
+    maps = loadmat(tmp_path / "mat/b.mat")
+    assert maps["logarithmic_xx"].shape == tuple(-(-n // 2) for n in GRID.shape)
+    assert np.nanmedian(maps["rotation"]) == pytest.approx(np.degrees(np.arctan2(-0.03, 1.99)))
+    field = read_field(tmp_path / "vtu/b.vtu")
+    np.testing.assert_allclose(field.u, affine(STRETCH), atol=1e-9)
+    own = read_field(tmp_path / "hdf5/b.h5")
+    np.testing.assert_allclose(own.u, affine(STRETCH), atol=1e-9)
+    assert own.convention == "modeharvest: in mm, y up"
+
+
+def test_lengths_in_pixels_stay_so(tmp_path: Path) -> None:
+    grid = replace(GRID, pixel_size=1.0, x0=-60.0, y0=40.0)
+    in_px = replace(result(affine(STRETCH)), grid=grid)
+    write_result(tmp_path / "a.h5", in_px, Given("px"))
+    field = read_field(tmp_path / "a.h5", grid)
+    np.testing.assert_allclose(np.column_stack([field.x, field.y]), MESH.nodes, atol=1e-9)
+    np.testing.assert_allclose(field.u, affine(STRETCH), atol=1e-9)
+    with pytest.raises(InputError, match="expected the size of a pixel for gom"):
+        FinishedRun.read(tmp_path / "a.h5").export("gom", tmp_path / "out", 3)
+
+
+def test_gauges_of_a_run(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(monkeypatch, "gauges", run, run / "gauges.toml") == 0
+    assert "L  engineering strain" in capsys.readouterr().out
+    head, *rows = (run / "gauges.csv").read_text().splitlines()
+    read = dict(zip(head.split(","), rows[1].split(","), strict=True))
+    strain = np.linalg.norm(np.eye(2)[0] + 2.0 * (STRETCH - np.eye(2))[:, 0]) - 1.0
+    assert float(read["L engineering_strain [-]"]) == pytest.approx(strain)
+    assert float(read["L sd engineering_strain [-]"]) > 0.0
+    assert (run / "gauges.pdf").read_bytes()[:5] == b"%PDF-"
+    assert len((run / "gauges_along.csv").read_text().splitlines()) == 1 + 2 * 31
+
+
+def test_a_field_is_animated_on_the_photographs(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert called(monkeypatch, "animate", run, "--field", "rotation") == 0
+    with Image.open(run / "rotation.gif") as picture:
+        assert picture.n_frames == 2
+        first = np.asarray(picture.convert("RGB")).astype(int)
+    assert (abs(first - first.mean(axis=2, keepdims=True)).max(axis=2) > 30).mean() > 0.2  # colours
+    pytest.importorskip("imageio_ffmpeg")
+    assert called(monkeypatch, "animate", run, "--as", "mp4") == 0
+    assert (run / "u.mp4").stat().st_size > 1000
+
+
+def test_fields_are_printed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = "--field", "u", "--field", "stretch_1"
+    assert called(monkeypatch, "animate", run, "--as", "pdf", *wanted) == 0
+    content = (run / "fields.pdf").read_bytes()
+    assert content.count(b"/Type /Page ") + content.count(b"/Type /Page\n") == 1 + 2 * 2
+
+
+def test_what_cannot_be_done_is_one_line(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, words in (
+        (("animate", run, "--field", "strain"), "expected a field's component, got 'strain'"),
+        (("animate", run, "--as", "avi"), "expected --as gif, mp4 or pdf, got 'avi'"),
+        (("export", run, "--as", "xls", "--out", tmp_path), "expected a format among ncorr"),
+        (("gauges", tmp_path, run / "gauges.toml"), "expected a folder of 'measure'"),
+    ):
+        assert called(monkeypatch, *arguments) == 2
+        assert words in error_line(capsys)

@@ -1,0 +1,326 @@
+"""Folders, videos and machines' logs: which photographs there are, when, and under what force."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic_photographs import Photographed, lattice_points, of
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.modes import square_family
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.imaging.photographs.sequence import Video, natural, numbered, odd_numbers, times_of
+from modeharvest.runs.photographs.machine_log import LogTable, read_log
+from modeharvest.runs.photographs.pipeline import harvest
+from modeharvest.runs.photographs.sequence import ChosenFrames, FrameChoice, chosen_frames
+from modeharvest.util.errors import InputError, MissingDependencyError
+
+SHAPE = (48, 64)
+
+
+def grey(level: int) -> np.ndarray:
+    image = np.full(SHAPE, level, np.uint8)
+    image[:, ::8] = 255 - level
+    return image
+
+
+def folder_of(folder: Path, names: list[str]) -> Path:
+    folder.mkdir()
+    for k, name in enumerate(names):
+        write_image(folder / f"{name}.tif", grey(10 + k))
+    return folder
+
+
+def film(path: Path, count: int, rate: float = 4.0) -> Path:
+    """A video whose frames' grey levels tell their numbers."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    stream = ffmpeg.write_frames(
+        str(path), SHAPE[::-1], pix_fmt_in="gray", fps=rate, macro_block_size=1,
+        codec="libx264", output_params=["-crf", "1"], ffmpeg_log_level="error",
+    )  # fmt: skip
+    stream.send(None)
+    for k in range(count):
+        stream.send(np.ascontiguousarray(np.full(SHAPE, 10 * k + 20, np.uint8)))
+    stream.close()
+    return path
+
+
+def chosen(base: Path, *names: str, log: LogTable | None = None, **choice: object) -> ChosenFrames:
+    how = FrameChoice(**choice)  # type: ignore[arg-type]
+    return chosen_frames(base, "ref.tif", names, how, log or LogTable(), base / "out")
+
+
+def test_frame_2_comes_before_frame_10(tmp_path: Path) -> None:
+    folder_of(tmp_path / "shots", ["frame_10", "frame_2", "frame_1"])
+    (tmp_path / "shots/notes.txt").write_text("no photograph")
+    (tmp_path / "shots/.hidden.tif").write_text("none either")
+    expected = ["frame_1", "frame_2", "frame_10"]
+    for name in ("shots", "shots/*.tif"):
+        assert [path.stem for path in chosen(tmp_path, name).deformed] == expected
+    assert sorted(["b10", "B9", "a"], key=natural) == ["a", "B9", "b10"]
+
+
+def test_the_reference_is_not_among_the_deformed(tmp_path: Path) -> None:
+    folder_of(tmp_path / "shots", ["f0", "f1", "f2"])
+    found = chosen_frames(
+        tmp_path, "shots/f0.tif", ["shots"], FrameChoice(), LogTable(), tmp_path / "out"
+    )
+    assert [path.stem for path in found.deformed] == ["f1", "f2"]
+
+
+def test_an_empty_folder_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "shots").mkdir()
+    with pytest.raises(InputError, match="found none among its 0 entries"):
+        chosen(tmp_path, "shots")
+
+
+def test_missing_and_repeated_numbers_are_reported() -> None:
+    def text(*names: str) -> str:
+        return " ".join(odd_numbers(numbered([Path(f"{name}.tif") for name in names])))
+
+    assert text("f1", "f2", "f3") == ""
+    assert "missing: 3, 4 of 6" in text("f1", "f2", "f5", "f6")
+    assert "numbers 2 are there twice" in text("f1", "f2", "f02", "f3")
+    assert text("f100", "f200", "f300") == ""  # that is how they are numbered
+    assert text("strain_0310", "strain_0455", "strain_0500") == ""
+
+
+def test_two_photographs_of_one_name_are_one(tmp_path: Path) -> None:
+    folder_of(tmp_path / "shots", ["f1", "f2"])
+    Image.fromarray(grey(3)).save(tmp_path / "shots/f1.png")
+    found = chosen(tmp_path, "shots")
+    assert len(found.deformed) == 2
+    assert [reason for _, reason in found.skipped] == ["another photograph has this name"]
+
+
+def test_frames_are_chosen(tmp_path: Path) -> None:
+    folder_of(tmp_path / "shots", [f"f{k}" for k in range(10)])
+
+    def numbers(**choice: object) -> list[int]:
+        return [int(path.stem[1:]) for path in chosen(tmp_path, "shots", **choice).deformed]
+
+    assert numbers(every=4) == [0, 4, 8]
+    assert numbers(frames=(7, 2)) == [2, 7]
+    assert numbers(per_second=2.0, between_s=(1.0, 2.1)) == [2, 3, 4]
+    with pytest.raises(InputError, match="got 12 that none has; there are 0 to 9"):
+        numbers(frames=(3, 12))
+    with pytest.raises(InputError, match="got none of 10"):
+        numbers(per_second=2.0, between_s=(90.0, 99.0))
+    with pytest.raises(InputError, match="expected a log with a crosshead and a length"):
+        numbers(strains=(0.1,))
+
+
+def test_times_are_of_names_exif_or_files(tmp_path: Path) -> None:
+    names = [tmp_path / f"cam_2026-03-01_10-00-{s}.tif" for s in ("00", "07", "30-5")]
+    times, source = times_of(names)
+    assert source == "names"
+    assert times is not None
+    assert np.diff(times) == pytest.approx([7.0, 23.5])
+    assert times_of([Path("t=0.5s.tif"), Path("t=12.0s.tif")])[0] == [0.5, 12.0]
+    plain = [tmp_path / "a.jpg", tmp_path / "b.jpg"]
+    for k, path in enumerate(plain):
+        exif = Image.Exif()
+        exif[306] = f"2026:03:01 10:00:0{k}"
+        Image.fromarray(grey(9)).save(path, exif=exif)
+        os.utime(path, (5000.0 + 3 * k, 5000.0 + 3 * k))
+    times, source = times_of(plain)
+    assert (np.diff(times or []), source) == (1.0, "Exif")
+    for path in plain:
+        Image.fromarray(grey(9)).save(path)
+    for k, path in enumerate(plain):
+        os.utime(path, (5000.0 + 3 * k, 5000.0 + 3 * k))
+    times, source = times_of(plain)
+    assert (np.diff(times or []), source) == (3.0, "times of change")
+
+
+# -- videos ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["mp4", "avi", "mov"])
+def test_frames_of_a_video(tmp_path: Path, kind: str) -> None:
+    film(tmp_path / f"test.{kind}", 12)
+    video = Video.of(tmp_path / f"test.{kind}")
+    assert (video.count, video.rate) == (12, pytest.approx(4.0, rel=0.1))
+    found = chosen_frames(
+        tmp_path, f"test.{kind}", [f"test.{kind}"], FrameChoice(every=5), LogTable(),
+        tmp_path / "out",
+    )  # fmt: skip
+    assert found.reference.stem == "test_000000"
+    assert [path.stem for path in found.deformed] == ["test_000001", "test_000006", "test_000011"]
+    levels = [np.asarray(Image.open(path)).mean() for path in (found.reference, *found.deformed)]
+    assert levels == pytest.approx([20, 30, 80, 130], abs=2.0)
+    assert [known["time_s"] for known in found.recorded.values()] == pytest.approx([0, 1.25, 2.5])
+    stamps = [path.stat().st_mtime_ns for path in found.deformed]
+    chosen_frames(tmp_path, f"test.{kind}", [f"test.{kind}"], FrameChoice(every=5), LogTable(),
+                  tmp_path / "out")  # fmt: skip
+    assert [path.stat().st_mtime_ns for path in found.deformed] == stamps  # finished before
+
+
+def test_a_reference_inside_a_video(tmp_path: Path) -> None:
+    film(tmp_path / "test.mp4", 6)
+    found = chosen_frames(
+        tmp_path, "test.mp4#3", ["test.mp4"], FrameChoice(), LogTable(), tmp_path / "out"
+    )
+    assert found.reference.stem == "test_000003"
+    assert [path.stem[-1] for path in found.deformed] == list("01245")
+
+
+def test_videos_that_cannot_be_read_are_one_line(tmp_path: Path) -> None:
+    whole = film(tmp_path / "test.mp4", 12).read_bytes()
+    (tmp_path / "none.mp4").write_bytes(b"no video at all" * 100)
+    with pytest.raises(InputError, match="ffmpeg says"):
+        Video.of(tmp_path / "none.mp4")
+    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut\.mp4"):
+        Video.of(tmp_path / "cut.mp4")
+    assert [number for number, _ in Video.of(tmp_path / "test.mp4").levels([7, 40])] == [7]
+
+
+def test_without_the_library_one_line_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "test.mp4").write_bytes(b"whatever")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingDependencyError, match="pip install imageio-ffmpeg"):
+        chosen(tmp_path, "test.mp4")
+
+
+# -- logs --------------------------------------------------------------------------------
+
+LOGS = {
+    "german": (
+        "Prüfung;Nr. 7\nZeit;Standardweg;Standardkraft\ns;mm;N\n"
+        "0,0;0,000;0,0\n1,0;0,100;2,5\n2,0;0,200;5,0\n3,0;0,300;1.007,5\n"
+    ),
+    "english": (
+        "Operator,Smith\nTime (s),Crosshead (mm),Load (kN)\n"
+        "0.0,0.000,0.0\n1.0,0.100,0.0025\n2.0,0.200,0.005\n3.0,0.300,1.0075\n"
+    ),
+    "tabs": (
+        "Elapsed Time [ms]\tForce [N]\tPosition [µm]\n"
+        "0\t0.0\t0\n1000\t2.5\t100\n2000\t5.0\t200\n3000\t1007.5\t300\n"
+    ),
+    "blanks": "t F x\n0.0 0.0 0.0\n1.0 2.5 0.1\n2.0 5.0 0.2\n3.0 1007.5 0.3\n",
+    "clock": (
+        "Date;Time;Force / N;Crosshead / mm\n01.03.2026;10:00:00,0;0;0\n"
+        "01.03.2026;10:00:01,0;2,5;0,1\n01.03.2026;10:00:02,0;5;0,2\n01.03.2026;10:00:03,0;1007,5;0,3\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_logs_of_many_dialects(tmp_path: Path, name: str, encoding: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(LOGS[name], encoding)
+    log = read_log(path, LogTable("log.csv"))
+    assert log.time - log.time[0] == pytest.approx([0, 1, 2, 3])
+    assert log.force == pytest.approx([0, 2.5, 5, 1007.5])
+    assert log.crosshead == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert log.is_dated == (name == "clock")
+
+
+def test_columns_are_named_where_they_are_not_known(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("uptime,P,unrelated\n0,1,9\n1,2,9\n2,3,9\n")
+    with pytest.raises(InputError, match=r"expected a column of time, got uptime, P, unrelated"):
+        read_log(path, LogTable("log.csv"))
+    with pytest.raises(InputError, match="expected a column of force or crosshead"):
+        read_log(path, LogTable("log.csv", time="uptime"))
+    with pytest.raises(InputError, match=r"expected the column 'Q' of log\.force"):
+        read_log(path, LogTable("log.csv", time="uptime", force="Q"))
+    assert read_log(path, LogTable("log.csv", time="uptime", force="P")).force is not None
+    path.write_text("nothing here\n")
+    with pytest.raises(InputError, match="rows of two numbers"):
+        read_log(path, LogTable("log.csv"))
+
+
+def stamped(base: Path, hour: int = 10) -> Path:
+    return folder_of(base / "shots", [f"c_20260301_{hour}000{s}" for s in range(4)])
+
+
+def test_forces_are_joined_by_time(tmp_path: Path) -> None:
+    stamped(tmp_path)
+    (tmp_path / "log.csv").write_text(LOGS["clock"])
+    table = LogTable("log.csv", length=10.0)
+    found = chosen(tmp_path, "shots", log=table)
+    forces = [known["force_N"] for known in found.recorded.values()]
+    assert forces == pytest.approx([0, 2.5, 5, 1007.5])
+    assert not any("time zone" in note for note in found.notes)
+    found = chosen(tmp_path, "shots", log=table, strains=(0.01, 0.03))
+    assert [path.stem[-1] for path in found.deformed] == ["1", "3"]
+
+
+def test_another_time_zone_is_found_and_reported(tmp_path: Path) -> None:
+    stamped(tmp_path, hour=12)
+    (tmp_path / "log.csv").write_text(LOGS["clock"])
+    found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
+    forces = [known["force_N"] for known in found.recorded.values()]
+    assert forces == pytest.approx([0, 2.5, 5, 1007.5])
+    assert any("-2 h ahead" in note and "time zone" in note for note in found.notes)
+
+
+def test_an_offset_may_be_given_and_what_was_not_logged_has_no_force(tmp_path: Path) -> None:
+    stamped(tmp_path)
+    (tmp_path / "log.csv").write_text(LOGS["clock"])
+    found = chosen(tmp_path, "shots", log=LogTable("log.csv", offset_s=4.0))
+    forces = [known["force_N"] for known in found.recorded.values()]
+    assert forces[0] == pytest.approx(1007.5)
+    assert forces[-1] is None
+    assert any("3 of 4 photographs were taken while nothing was logged" in n for n in found.notes)
+
+
+def test_a_log_without_dates_begins_with_the_first_photograph(tmp_path: Path) -> None:
+    stamped(tmp_path)
+    (tmp_path / "log.csv").write_text(LOGS["english"])
+    found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
+    assert [known["force_N"] for known in found.recorded.values()] == pytest.approx(
+        [0, 2.5, 5, 1007.5]
+    )
+    assert any("taken to begin with the first photograph" in note for note in found.notes)
+
+
+def test_a_video_is_harvested_with_its_log(
+    tmp_path: Path, undrawn_pictures: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the files that a camera and a testing machine leave to force over strain."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    pitch, pixel = 1.9, 0.035
+    cellular, domain = (Box.centred(4 * pitch + d, 5 * pitch + d) for d in (0.0, 1.6))
+    holes = lattice_points(pitch * np.eye(2), cellular, (pitch / 2, 0.0))
+    shown = Photographed(PixelGrid.centred(360, 300, pixel), domain, holes, 1.4)
+    ansatz = Ansatz.on(domain, [(square_family(), cellular)], pitch)
+    strains = (0.0, 0.01, 0.02, 0.03)
+    stream = ffmpeg.write_frames(
+        str(tmp_path / "test.avi"), (300, 360), pix_fmt_in="gray", pix_fmt_out="gray", fps=2.0,
+        macro_block_size=1, codec="ffv1", ffmpeg_log_level="error",
+    )  # fmt: skip
+    stream.send(None)
+    for k, strain in enumerate(strains):
+        state = of(ansatz, ansatz.initial_guess(strain, 1e-9))
+        stream.send(np.ascontiguousarray(shown.image(state, exposure=k)))
+    stream.close()
+    (tmp_path / "log.csv").write_text("Time [s];Force [kN]\n0;0\n10;0,1\n")
+    (tmp_path / "experiment.toml").write_text(
+        '[images]\nreference = "test.avi"\ndeformed = ["test.avi"]\nevery = 2\n'
+        f'[log]\nfile = "log.csv"\n[scale]\npixel_size = {pixel}\n'
+        f"[specimen]\ncell_size = {pitch}\n[correlation]\nv0_degree = 2\nv_degree = 1\n"
+    )
+    summary = harvest(tmp_path / "experiment.toml", tmp_path / "out")
+    frames = summary["frames"]
+    assert [frame["name"] for frame in frames] == ["test_000001", "test_000003"]
+    assert [frame["strain"] for frame in frames] == pytest.approx([0.01, 0.03], abs=5e-4)
+    assert [frame["time_s"] for frame in frames] == [0.0, 1.0]
+    assert [frame["force_N"] for frame in frames] == pytest.approx([5.0, 15.0])
+    assert summary["experiment"]["images"]["deformed"] == ["test.avi"]
+    assert "timeline-force" in (tmp_path / "out/report.html").read_text("utf-8")
+    # A second run does nothing anew, not even the decoding.
+    monkeypatch.setattr(Video, "levels", None)
+    assert harvest(tmp_path / "experiment.toml", tmp_path / "out") == summary

@@ -1,0 +1,235 @@
+"""A test that is watched: photographs measured as they come, buckling predicted before it does."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from synthetic_photographs import Displacement, Photographed, lattice_points, of
+from test_cli import called
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.modes import square_family
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs.watch import WatchedTest, arriving, watch
+from modeharvest.util.errors import InputError
+from modeharvest.validation.growth import follow_growth, predict
+
+PITCH, PIXEL = 1.9, 0.035
+CRITICAL = 0.06
+CELLULAR = Box.centred(4 * PITCH, 5 * PITCH)
+DOMAIN = Box.centred(4 * PITCH + 1.6, 5 * PITCH + 1.6)
+HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, 0.0))
+STRAINS = CRITICAL * np.linspace(0.1, 0.7, 7)
+
+
+# -- the prediction ----------------------------------------------------------------------
+
+
+def grown(load: np.ndarray, linear: float = 3.0, imperfection: float = 5.0) -> np.ndarray:
+    return linear * load + imperfection * load / (0.1 - load)
+
+
+def test_growth_without_noise_points_to_the_critical_load() -> None:
+    load = np.linspace(0.005, 0.06, 12)
+    for linear, imperfection in ((0.0, 5.0), (40.0, 5.0), (-20.0, -1.0)):
+        found = predict(load, grown(load, linear, imperfection), np.full(12, 1e-6))
+        assert found is not None
+        assert found.critical == pytest.approx(0.1, rel=2e-3)  # the grid of what is tried
+        assert found.imperfection == pytest.approx(imperfection, rel=0.02)
+        assert found.low < 0.1 < found.high
+        assert (found.largest, found.count) == (0.06, 12)
+
+
+def test_intervals_hold_over_seeds() -> None:
+    """95 %, and a little more, as the method's own error is in them and not in the data."""
+    load, sd = np.linspace(0.004, 0.07, 20), np.full(20, 0.05)
+    covered = []
+    for seed in range(200):
+        noise = sd * np.random.default_rng(seed).normal(size=20)
+        found = predict(load, grown(load) + noise, sd)
+        assert found is not None
+        covered.append(found.low <= 0.1 <= found.high)
+    assert 0.93 <= np.mean(covered) <= 1.0
+
+
+def test_noise_that_is_larger_than_it_says_widens_the_interval() -> None:
+    load, random = np.linspace(0.004, 0.07, 20), np.random.default_rng(3)
+    amplitude = grown(load) + 0.1 * random.normal(size=20)
+    modest, honest = (predict(load, amplitude, np.full(20, sd)) for sd in (1e-4, 0.1))
+    assert modest is not None
+    assert honest is not None
+    assert modest.high - modest.low > 0.7 * (honest.high - honest.low)
+
+
+def test_what_does_not_grow_predicts_nothing() -> None:
+    load = np.linspace(0.01, 0.06, 12)
+    noise = np.random.default_rng(1).normal(size=12)
+    found = predict(load, noise, np.ones(12))
+    assert found is None or not found.is_useful
+    found = predict(load, 3.0 * load, np.full(12, 1e-3))  # along a straight line
+    assert found is None or not found.is_useful
+    assert predict(load[:4], grown(load[:4]), np.ones(4)) is None
+
+
+def test_a_prediction_stays_once_buckling_is_near() -> None:
+    load = np.linspace(0.005, 0.13, 26)
+    amplitude = np.where(load < 0.097, grown(np.minimum(load, 0.097)), 200.0)
+    found = follow_growth(load.tolist(), amplitude.tolist(), [0.01] * 26)
+    assert found[3] is None
+    assert found[-1] == found[20]
+    assert found[-1] is not None
+    assert found[-1].critical == pytest.approx(0.1, rel=0.01)
+    assert found[-1].largest < 0.1
+
+
+# -- watching ----------------------------------------------------------------------------
+
+
+def photographed(seed: int = 2) -> Photographed:
+    return Photographed(PixelGrid.centred(360, 300, PIXEL), DOMAIN, HOLES, 1.4, seed)
+
+
+def truth(strain: float) -> Displacement:
+    """An imperfect pattern on its way to buckling, of holes that turn."""
+    family = square_family("junction").moved((0.0, PITCH / 2))
+    ansatz = Ansatz.on(DOMAIN, [(family, CELLULAR)], PITCH)
+    return of(ansatz, ansatz.initial_guess(strain, 0.5 * strain / (CRITICAL - strain)))
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven states up to 70 % of the critical strain, and what is no photograph of them."""
+    folder = tmp_path_factory.mktemp("test")
+    shots = folder / "shots"
+    shots.mkdir()
+    shown = photographed()
+    tifffile.imwrite(folder / "reference.tif", shown.image())
+    for k, strain in enumerate(STRAINS):
+        light = 0.9 + 0.02 * k  # which drifts
+        levels = light * shown.image(truth(strain), exposure=k + 1)
+        tifffile.imwrite(shots / f"frame_{k + 1}.tif", levels.astype(np.uint8))
+    tifffile.imwrite(shots / "frame_10.tif", photographed(seed=9).image(truth(0.03)))
+    (shots / "frame_11.tif").write_bytes(b"II*\0 and no more")
+    old = time.time() - 60.0
+    for path in shots.iterdir():
+        os.utime(path, (old, old))
+    (folder / "experiment.toml").write_text(
+        '[images]\nreference = "reference.tif"\ndeformed = ["shots"]\n'
+        f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = {PITCH}\n"
+    )
+    return folder / "experiment.toml"
+
+
+@pytest.fixture(scope="module")
+def watched(experiment: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, WatchedTest]:
+    out = tmp_path_factory.mktemp("out")
+    return out, watch(experiment, out, until_still=0.1)
+
+
+def test_photographs_are_measured_in_their_order(watched: tuple[Path, WatchedTest]) -> None:
+    _, test = watched
+    assert [row["name"] for row in test.rows] == [f"frame_{k}.tif" for k in range(1, 8)]
+    assert [row["strain"] for row in test.rows] == pytest.approx(list(STRAINS), abs=5e-4)
+    assert test.conclusion == "No photograph came for 0.1 s."
+
+
+def test_buckling_is_predicted_from_seven_tenths(watched: tuple[Path, WatchedTest]) -> None:
+    found = watched[1].predictions[-1]
+    assert found is not None
+    assert found.critical == pytest.approx(CRITICAL, rel=0.03)
+    assert found.low < CRITICAL < found.high
+    assert found.largest == pytest.approx(0.7 * CRITICAL, rel=0.01)
+
+
+def test_others_are_skipped_with_a_reason(watched: tuple[Path, WatchedTest]) -> None:
+    _, test = watched
+    reasons = {row["name"]: row["reason"] for row in test.skipped}
+    assert set(reasons) == {"frame_10.tif", "frame_11.tif"}
+    assert "surface" in reasons["frame_10.tif"]
+    assert "frame_11.tif" in reasons["frame_11.tif"]
+
+
+def test_the_page_holds_all_and_reloads_until_the_end(
+    watched: tuple[Path, WatchedTest], experiment: Path, tmp_path: Path
+) -> None:
+    out, test = watched
+    page = (out / "watch.html").read_text("utf-8")
+    assert page.count("<svg") == 3
+    assert "It buckles at" in page
+    assert "http-equiv" not in page
+    assert "src=" not in page
+    from modeharvest.report.figures.sequence import write_watch_page
+
+    write_watch_page(tmp_path / "watch.html", "<b>", WatchedTest(test.rows[:1]), None)
+    page = (tmp_path / "watch.html").read_text("utf-8")
+    assert 'http-equiv="refresh"' in page
+    assert "&lt;b&gt;" in page
+
+
+def test_it_goes_on_where_it_stopped(watched: tuple[Path, WatchedTest], experiment: Path) -> None:
+    out, test = watched
+    seconds = [row["seconds"] for row in json.loads((out / "watch.json").read_text())["frames"]]
+    again = watch(experiment, out, until_still=0.1)
+    assert [row["seconds"] for row in again.rows] == seconds
+    assert again.skipped == test.skipped
+
+
+def test_a_file_half_written_is_waited_for(tmp_path: Path) -> None:
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    tifffile.imwrite(tmp_path / "whole.tif", np.arange(64 * 64, dtype=np.uint8).reshape(64, 64))
+    content = (tmp_path / "whole.tif").read_bytes()
+    path = shots / "a.tif"
+
+    def camera() -> None:
+        with path.open("wb") as file:
+            for part in np.array_split(np.frombuffer(content, np.uint8), 4):
+                file.write(part.tobytes())
+                file.flush()
+                time.sleep(0.3)
+
+    thread = threading.Thread(target=camera)
+    thread.start()
+    (found,) = arriving(shots, tmp_path / "whole.tif", WatchedTest(), 3.0)
+    assert found.read_bytes() == content
+    thread.join()
+
+
+def test_an_interruption_leaves_what_is_there(experiment: Path, tmp_path: Path) -> None:
+    def show(line: str) -> None:
+        raise KeyboardInterrupt
+
+    test = watch(experiment, tmp_path, show=show)
+    assert test.conclusion == "Watching was interrupted."
+    assert len(json.loads((tmp_path / "watch.json").read_text())["frames"]) == 1
+    assert (tmp_path / "watch.html").is_file()
+
+
+def test_bad_input_is_one_line(experiment: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected a folder to watch"):
+        watch(experiment, tmp_path, tmp_path / "nowhere")
+
+
+def test_the_command(
+    experiment: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shots = tmp_path / "few"
+    shots.mkdir()
+    (shots / "frame_1.tif").write_bytes((experiment.parent / "shots/frame_1.tif").read_bytes())
+    code = called(monkeypatch, "harvest", experiment, "--watch", shots, "--until-still", "0.5",
+                  "--out", tmp_path / "out")  # fmt: skip
+    printed = capsys.readouterr().out
+    assert code == 0
+    assert "frame_1.tif" in printed
+    assert "No photograph came for 0.5 s." in printed
