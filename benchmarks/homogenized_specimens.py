@@ -1,13 +1,15 @@
 """Homogenized specimens with bulk edges beside their direct simulations, and what they cost.
 
 ``scripts/env python benchmarks/homogenized_specimens.py [SECTION ...]`` prints tables of
-docs/homogenization.md, as Markdown:
+docs/explanation/homogenization_studies.md, as Markdown:
 
 - ``specimen``: the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
 - ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.
 - ``positions``: means over positions of the RVE that are spread evenly over a cell, of strips and
   specimens.
 - ``translations``: specimens whose lattice is moved against their bulk edges, and their mean.
+- ``edges``: what solid strips before the plates and along the sides are worth before buckling.
+- ``plates``: specimens with and without solid strips before the plates, at 8 to 11 %.
 - ``bent``: a specimen bent or sheared as it is compressed.
 - ``triangular``: a specimen of triangular stacking.
 - ``cost``: seconds and memory a linearisation and RVE, from 60 to 10 000 RVEs.
@@ -48,6 +50,7 @@ from homogenization import (
     spread,
     supercell,
 )
+from homogenized_bowing import with_shear
 from mpi4py import MPI
 
 from modeharvest.fem.experiment import Experiment, PathOptions
@@ -287,6 +290,81 @@ def translations() -> None:
             row(f"homogenized, {count} position(s)", *cells, last.negative_eigenvalues)
 
 
+EARLY = 0.01
+"""A strain at which patterns play no part [-]."""
+
+
+def edges() -> None:
+    """Energy that homogenized specimens of several sizes have too much, by their solid edges.
+
+    Of n x m cells it is e0 + e1 m + e2 n + e3 n m: of corners, plates, sides and the inside.
+    """
+    sizes = ((6, 10), (12, 10), (12, 20), (24, 20))
+    rve = RVE(supercell(), MATERIAL, [], JUNCTION)
+    head(f"at {EARLY:.0%}: strips before plates, along sides [mm]",
+         *(f"{n} x {m} [1e-6 N]" for n, m in sizes), "inside, of a cell's",
+         "plates, a row", "sides, a column", "corners")  # fmt: skip
+    n, m = np.array(sizes, float).T
+    terms = np.stack([n**0, m, n, n * m], axis=1)
+    for bulk_y, bulk_x in product((0.9, 0.0), (1.9, 0.0)):
+        both = list[tuple[float, float]]()
+        for size in sizes:
+            specimen = Specimen(*size, bulk_x=bulk_x, bulk_y=bulk_y)
+            loading = EdgeCompression(specimen.half_size[0], specimen.length)
+            structure = Structure(mesh_specimen(specimen, SIZE), MATERIAL, loading)
+            follower = PathFollower(structure, PathOptions())
+            path = [follower.start()]
+            follower.follow_primary(path, (EARLY,), until_unstable=True)
+            body = HomogenizedBody.of_specimen(
+                specimen, rve, PlateLoading(quarter=True), divisions=size
+            )
+            found = homogenize(body, [EARLY])
+            both.append((found.states[0].energy, structure.energy(path[-1].u)))
+        energy, exact = 1e6 * np.array(both).T
+        cell = np.linalg.solve(terms, exact)[3]
+        corners, plates, sides, inside = np.linalg.solve(terms, energy - exact)
+        row(f"{bulk_x:g}, {bulk_y:g}",
+            *(f"{a - b:+.0f} ({a / b - 1:+.2%})" for a, b in zip(energy, exact, strict=True)),
+            f"{inside / cell:+.2%}", f"{plates:+.1f}", f"{sides:+.1f}",
+            f"{corners:+.0f}")  # fmt: skip
+
+
+STRAINS = (0.08, 0.09, 0.1, 0.11)
+
+
+def plates() -> None:
+    """Specimens with solid strips before the plates and without, by the choices that there are."""
+    at = (f"energy, force at {e:.0%}" for e in STRAINS)
+    head("specimen", "strips [mm]", "homogenized", "RVEs", "ε_c", *at)
+    quarter, free = {"quarter": True}, {"quarter": True, "pattern_at_bulk": "free"}
+    for size, strip in product(((6, 10), (12, 10)), (0.0, 1.9)):
+        specimen, name = Specimen(*size, bulk_x=strip), f"{size[0]} x {size[1]}"
+        direct = simulate(Experiment(specimen, strains=STRAINS))
+        states, exact = states_of(direct, STRAINS), direct.info["critical"]["strain"]
+        row(name, strip, "direct", "", f"{exact:.3%}",
+            *(f"{energy:.5f} N, {force:.5f} N/mm" for energy, force, _ in states))  # fmt: skip
+        cases: list[tuple[str, RVE | list[RVE], dict[str, Any]]]
+        cases = [("1 position", analytic(), quarter), ("5 positions", spread(5), quarter)]
+        if strip:
+            cases.append(("v free along the sides", analytic(), free))
+            cases.append(("whole, with φ_S as a second mode", with_shear(), {}))
+        if strip and size == (12, 10):
+            cases.append(("Bloch φ", computed(), quarter))
+            cases.append(("centre on a hole", analytic(HOLE), quarter))
+        for what, rves, options in cases:
+            parts = PARTS[size] if options else (size[0] // 2, size[1] // 2)
+            body = HomogenizedBody.of_specimen(
+                specimen, rves, PlateLoading(**options), divisions=parts
+            )
+            found = homogenize(body, STRAINS)
+            e = found.critical.load if found.critical else np.nan
+            both = zip(found.states, states, strict=False)
+            row(name, strip, what, body.point_count * len(body.rves),
+                f"{e:.3%} ({e / exact - 1:+.2%})",
+                *(f"{h.energy / energy - 1:+.2%}, {h.force / force - 1:+.2%}"
+                  for h, (energy, force, _) in both))  # fmt: skip
+
+
 DirectState = tuple[float, float, int]
 """Energy [N], force [N/mm], negative eigenvalues."""
 
@@ -462,8 +540,8 @@ def shipped() -> None:
 
 SECTIONS: dict[str, Callable[[], None]] = {
     "specimen": specimen, "choices": choices, "positions": positions,
-    "translations": translations, "bent": bent, "triangular": triangular, "cost": cost,
-    "shipped": shipped, "ranks": ranks,
+    "translations": translations, "edges": edges, "plates": plates, "bent": bent,
+    "triangular": triangular, "cost": cost, "shipped": shipped, "ranks": ranks,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Buckled branches of lattices: energies, stability, amplitudes (the tables of docs/modes.md)."""
+"""Buckled branches of lattices: energies, stability, amplitudes.
+
+The tables of docs/explanation/modes.md.
+"""
 
 from __future__ import annotations
 

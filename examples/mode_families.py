@@ -1,4 +1,7 @@
-"""Mode families of lattices: waves, parameters, energy captured (the table of docs/families.md)."""
+"""Mode families of lattices: waves, parameters, energy captured.
+
+The table of docs/explanation/families.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read an RVE file (docs/rve.md) with h5py alone, and say what is in it.
+"""Read an RVE file (docs/reference/rve.md) with h5py alone, and say what is in it.
 
 python examples/read_rve.py out/homogenized/rve.h5
 """

@@ -370,10 +370,10 @@ def test_the_grid_has_every_wave_once() -> None:
 
 
 def test_the_recipe_works_as_printed() -> None:
-    page = (Path(__file__).parent.parent / "docs/bloch.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parent.parent / "docs/explanation/bloch.md").read_text(encoding="utf-8")
     recipe = page.split("```python\n")[1].split("```")[0]
     namespace: dict[str, Any] = {}
-    exec(compile(recipe, "docs/bloch.md", "exec", dont_inherit=True), namespace)
+    exec(compile(recipe, "docs/explanation/bloch.md", "exec", dont_inherit=True), namespace)
     found = namespace["found"]
     # The size of the cell is of no account: the same as for a pitch of 1 on a similar mesh.
     assert found.load == pytest.approx(critical("square", "uniaxial").load, rel=0.01)

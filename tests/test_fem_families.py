@@ -2,7 +2,7 @@
 
 Guards: the paper's reading of Fig. "modes" for the square stacking under every loading, at every
 origin and on meshes without symmetry; what is found on the post-buckled branch; the symmetries of
-the hexagonal modes; and that the recipe of docs/families.md runs.
+the hexagonal modes; and that the recipe of docs/explanation/families.md runs.
 """
 
 from __future__ import annotations
@@ -176,10 +176,10 @@ def test_recipe_of_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It runs, and says what the page says it says, up to digits that meshes may change."""
-    page = (Path(__file__).parents[1] / "docs" / "families.md").read_text("utf-8")
+    page = (Path(__file__).parents[1] / "docs/explanation/families.md").read_text("utf-8")
     recipe = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
-    exec(compile(recipe, "docs/families.md", "exec", dont_inherit=True), {})
+    exec(compile(recipe, "docs/explanation/families.md", "exec", dont_inherit=True), {})
     message = re.sub(r"[\d.]+", "#", capsys.readouterr().out).splitlines()
     shown = re.sub(r"[\d.]+", "#", page).splitlines()
     assert [line.strip() for line in shown if line.strip() in message] == message

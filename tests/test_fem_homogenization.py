@@ -201,7 +201,7 @@ def test_a_strip_between_plates_buckles_as_an_independent_calculation_found() ->
 
 
 def test_three_degenerate_modes_make_a_flower() -> None:
-    """As on the branches of the periodic cell (docs/modes.md), with the energies of these."""
+    """As on the branches of the periodic cell (docs/explanation/modes.md), with their energies."""
     lattice, material = hexagonal(1.386, 1.28, 1.386 / 4), TwoTermI1()
     primitive = PeriodicCell(lattice, material)
     loading = MacroLoading(((-1.0, 0.0), (0.0, -1.0)))
@@ -490,6 +490,8 @@ def test_modes_that_will_not_do_are_refused() -> None:
         RVE(cell(), Ogden(), [np.zeros_like(cell().mesh.nodes)])
     with pytest.raises(InputError, match="finite values"):
         RVE(cell(), Ogden(), [np.zeros((3, 2))])
+    with pytest.raises(InputError, match="0% of them finite"):
+        RVE(cell(), Ogden(), [lambda X: np.nan * X])
     with pytest.raises(InputError, match="normalisation"):
         RVE(cell(), Ogden(), [PATTERN], normalisation="unit")
 

@@ -212,10 +212,10 @@ def test_undeformed_state_is_stress_free_with_the_stated_moduli(
 
 
 def test_recipe_of_the_documentation_works() -> None:
-    page = (Path(__file__).parent.parent / "docs" / "fem.md").read_text("utf-8")
+    page = (Path(__file__).parent.parent / "docs/explanation/fem.md").read_text("utf-8")
     recipe = page.partition("## Add a material")[2].partition("```python")[2].partition("```")[0]
     namespace: dict[str, Any] = {"__name__": "recipe"}
-    exec(compile(recipe, "docs/fem.md", "exec", dont_inherit=True), namespace)
+    exec(compile(recipe, "docs/explanation/fem.md", "exec", dont_inherit=True), namespace)
     material = namespace["NeoHooke"]()
     energy, stress, tangent = evaluate(material, EYE)
     assert energy == pytest.approx(0.0, abs=1e-14)

@@ -255,11 +255,11 @@ def test_the_pattern_is_that_of_the_middle_of_a_finite_specimen() -> None:
 
 
 def test_the_recipe_works_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (Path(__file__).parent.parent / "docs/modes.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parent.parent / "docs/explanation/modes.md").read_text(encoding="utf-8")
     recipe = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {}
-    exec(compile(recipe, "docs/modes.md", "exec", dont_inherit=True), namespace)
+    exec(compile(recipe, "docs/explanation/modes.md", "exec", dont_inherit=True), namespace)
     assert [state.negative_eigenvalues for state in namespace["flower"].states] == [0, 0]
     modes, (flower,) = read_modes("flower.h5")
     assert modes.info["copies"] == [2, 2]

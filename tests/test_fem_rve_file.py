@@ -274,7 +274,7 @@ def test_every_array_says_its_unit_as_the_page_does(tmp_path: Path) -> None:
         tmp_path / "rve.h5", rve(), states(0), errors(), loads=[0.1] * 3,
         points=np.zeros((3, 2)), buckled=[True] * 3,
     )  # fmt: skip
-    table = (ROOT / "docs" / "rve.md").read_text("utf-8").splitlines()
+    table = (ROOT / "docs/reference/rve.md").read_text("utf-8").splitlines()
     rows = [[c.strip(" `") for c in line.split("|")[1:-1]] for line in table if line[:3] == "| `"]
     documented = {row[0].split("/")[-1]: row for row in rows}
     found = dict[str, h5py.Dataset]()

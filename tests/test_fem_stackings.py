@@ -229,7 +229,7 @@ def test_neighbours_are_at_the_pitch_in_triangular_stacking() -> None:
 
 
 def test_the_recipe_for_a_further_stacking_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[1] / "docs" / "extending.md").read_text("utf-8")
+    text = (Path(__file__).parents[1] / "docs/how-to/extending.md").read_text("utf-8")
     recipe = text.split("## A hole lattice")[1].split("```python\n")[1].split("```")[0]
     monkeypatch.setattr(specimen_module, "STACKINGS", dict(specimen_module.STACKINGS))
     monkeypatch.setattr(modes_module, "FAMILIES", dict(modes_module.FAMILIES))

@@ -30,6 +30,7 @@ from modeharvest.runs.homogenization.pipeline import HomogenizationRun
 from modeharvest.runs.homogenization.results import aligned, not_reached
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
+from modeharvest.validation.homogenization import ModeParameters
 
 FloatArray = NDArray[np.float64]
 SMALL = """
@@ -141,7 +142,7 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     summary = read_json(out / "summary.json")
     assert "critical strain" in (out / "report.html").read_text("utf-8")
     direct = summary["direct"]["critical_strain"]
-    # Four holes are few: docs/homogenization.md has the series over sizes.
+    # Four holes are few: homogenization_studies.md has the series over sizes.
     assert summary["critical_strain"] == pytest.approx(direct, rel=0.15)
     assert summary["first_order_critical_strain"] < 0.75 * direct
     for state, exact in zip(summary["states"], summary["direct"]["states"], strict=True):
@@ -419,6 +420,16 @@ def test_a_mesh_that_will_not_do_is_refused_in_one_line(
     assert "Traceback" not in error
 
 
+def test_a_folder_is_no_mode(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    """An empty path, which is the case's own folder, was once a fault of the program."""
+    text = SMALL.replace('"measured"', '"file"\npath = ""')
+    (tmp_path / "case.toml").write_text(text, "utf-8")
+    monkeypatch.setattr("sys.argv", ["modeharvest", "homogenize", "case.toml", "--out", "out"])
+    monkeypatch.chdir(tmp_path)
+    main_exit(2)
+    assert "expected a JSON file at ., found a folder" in " ".join(capsys.readouterr().err.split())
+
+
 class Modes:
     """A result with some modes."""
 
@@ -450,6 +461,26 @@ def test_three_measured_modes_are_snapped_each(tmp_path: Path) -> None:
     off[12:16] += [0.0, 0.0, 0.3, 0.0]
     with pytest.raises(InputError, match=r"phi3: mode: expected wave vectors within 10%"):
         run._modes_of(off)
+
+
+@pytest.mark.dolfinx
+def test_a_wave_vector_far_from_the_lattice_s_is_warned_of(tmp_path: Path) -> None:
+    """By its standard deviations where the model error is known, else by a hundredth of itself."""
+    case = case_of(tmp_path / "case.toml", SMALL)
+    run = HomogenizationRun(case, tmp_path / "out")
+    ansatz = Ansatz.of_specimen(case.experiment.specimen)
+    object.__setattr__(run, "result", Modes(ansatz))
+    family, noise, error = ansatz.modes[0].family, 1e-8 * np.eye(7), 1e-4 * np.eye(7)
+
+    def warned(off: float, by_model_error: FloatArray | None) -> bool:
+        values = family.start + off * np.array([0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        given = ModeParameters(family.names, family.units, values, noise, by_model_error)
+        warnings = run._far_waves(run._modes_of(values), given)
+        assert all("is this mode of this lattice?" in text for text in warnings)
+        return bool(warnings)
+
+    assert [warned(off, None) for off in (0.005, 0.02)] == [False, True]
+    assert [warned(off, error) for off in (0.02, 0.04)] == [False, True]
 
 
 @pytest.mark.dolfinx

@@ -23,7 +23,7 @@ from modeharvest.util.arrays import FloatArray
 
 SMOOTH, NOTCHED = 2.0, 1.0
 """Orders of convergence that critical loads have at least, by what the holes' edges are: between
-2.6 and 3.6 is observed for round holes (docs/bloch.md); notches make strains singular."""
+2.6 and 3.6 is seen for round holes (docs/explanation/bloch.md); notches make strains singular."""
 _NOTCH = 0.35  # rad: a kink that makes a notch
 ENOUGH = 3
 """Elements across a ligament."""

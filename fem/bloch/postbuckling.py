@@ -30,7 +30,7 @@ _FIRST, _LONGEST, _FARTHEST = 0.01, 0.02, 0.4
 _GROWTH = 1.6  # of the step from one point to the next
 _BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
 # Of the load: how far off a mode's own critical load may be, where a mesh splits a set (from 10 %
-# off the same branches are found, docs/modes.md), and a splitting that isn't rounding.
+# off the same branches are found, docs/explanation/modes.md), and a splitting that isn't rounding.
 _CRITICAL, _SPLIT = 3e-2, 1e-5
 _NEAR = 0.5  # of a step: how far from where it is expected a point may be
 _REFINEMENTS = 6

@@ -212,9 +212,7 @@ class RVE:
         diagonal = np.abs(np.diag(size))
         if not (diagonal > _DEPENDENT * diagonal.max(initial=0.0)).all():
             what = "modes: expected phi_i and phi_i X to be linearly independent on the cell"
-            raise InputError(
-                f"{what}, got such that are not; leave modes out or take a larger cell"
-            )
+            raise InputError(f"{what}, got others; leave modes out or take a larger cell")
         return np.ascontiguousarray(rows.T)
 
 
@@ -258,7 +256,8 @@ def _at_nodes(mode: ModeField, number: int, cell: UnitCell) -> FloatArray:
     values = np.asarray(mode(nodes) if callable(mode) else mode, dtype=np.float64)
     if values.shape != nodes.shape or not np.isfinite(values).all():
         what = f"expected finite values {nodes.shape} at the cell's nodes"
-        raise InputError(f"mode {number}: {what}, got {values.shape}")
+        got = f"{values.shape}, {np.isfinite(values).mean():.0%} of them finite"
+        raise InputError(f"mode {number}: {what}, got {got}")
     at_masters = np.zeros((cell.periodicity.count, 2))
     at_masters[cell.periodicity.master] = values
     off = np.abs(at_masters[cell.periodicity.master] - values).max()

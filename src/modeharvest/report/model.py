@@ -285,6 +285,8 @@ class Report:
     """A figure at the top, and its caption."""
     brief: ReportTable | None = None
     """A table for the terminal alone."""
+    explore: Callable[[], str] | None = None
+    """Makes the HTML of its fields to explore, when the page is written."""
 
     @property
     def cards(self) -> Iterator[Card]:
@@ -378,13 +380,11 @@ def draw_figures(figures: Iterable[ReportFigure], progress: Progress = silent) -
     """Draw figures one after the other, the late ones last; their SVG by their names."""
     from modeharvest.report.figures.style import style, to_svg
 
-    ordered = sorted(figures, key=lambda figure: figure.late)
     pictures = {}
-    for figure in counted(ordered, progress, "report"):
+    for f in counted(sorted(figures, key=lambda f: f.late), progress, "report"):
         with style():
-            drawn = figure.draw()
-        title = figure.label or figure.name
-        pictures[figure.name] = to_svg(drawn, figure.name, title, exact=figure.exact)
+            drawn = f.draw()
+        pictures[f.name] = to_svg(drawn, f.name, f.label or f.name, exact=f.exact)
     return pictures
 
 
@@ -401,14 +401,13 @@ def write_page(
     """
     if pictures is None:
         pictures = draw_figures(report.figures, progress)
-    page = page_template().render(report=report, pictures=pictures)
     with atomic(path) as temporary:
-        temporary.write_text(page, "utf-8")
+        temporary.write_text(page_template().render(report=report, pictures=pictures), "utf-8")
 
 
 @cache
-def page_template() -> jinja2.Template:
-    """Read and compile the page, once in a process."""
+def page_template(name: str = "page.html") -> jinja2.Template:
+    """Read and compile the page, or a part of it, once in a process."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -420,7 +419,7 @@ def page_template() -> jinja2.Template:
         "mark": lambda cell: isinstance(cell, Mark),
         "measured": lambda cell: isinstance(cell, Measured),
     }
-    return environment.get_template("page.html")
+    return environment.get_template(name)
 
 
 def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:

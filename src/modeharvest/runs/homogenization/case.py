@@ -67,7 +67,7 @@ class FileMode(_Numbered):
     def files(self) -> list[Path]:
         """Those that the name stands for, in order; itself if there are none."""
         named = Path(self.path)
-        return sorted(named.parent.glob(named.name)) or [named]
+        return (sorted(named.parent.glob(named.name)) if named.name else []) or [named]
 
     @property
     def is_computed(self) -> bool:
@@ -83,7 +83,7 @@ Mode = MeasuredMode | AnalyticMode | BlochMode | FileMode
 
 @dataclass(frozen=True)
 class HomogenizationOptions:
-    """Choices of homogenization that matter; docs/homogenization.md says how much."""
+    """Choices of homogenization that matter; docs/explanation/homogenization.md says how much."""
 
     centre: Literal["junction", "hole"] | tuple[float, float] | None = None
     """About which the RVE of 2 x 2 cells is cut, or a point of it [mm]; by default a junction in
@@ -97,8 +97,8 @@ class HomogenizationOptions:
     """The amplitudes v_i where the lattice meets solid strips along loaded and free edges."""
     quarter: bool | None = None
     """Whether only the quarter of the specimen is followed that its mirror images make whole: a
-    homogenized specimen may bow where the real one does not, see docs/homogenization.md. By default
-    where that can be: in square stacking and compression between free sides."""
+    homogenized specimen may bow where the real one does not (docs/explanation/homogenization.md).
+    By default where that can be: in square stacking and compression between free sides."""
     divisions: tuple[int, int] | None = None
     """Macroscopic elements of the lattice along x and y; by default as the cells ask for."""
     mesh: str | None = None

@@ -1,6 +1,6 @@
 """An RVE for other codes: its mesh, modes, moduli as HDF5, and in the layout of a MATLAB FE2 code.
 
-``examples/read_rve.py`` reads the HDF5 with h5py alone; docs/rve.md has its layout.
+``examples/read_rve.py`` reads the HDF5 with h5py alone; docs/reference/rve.md has its layout.
 """
 
 from __future__ import annotations

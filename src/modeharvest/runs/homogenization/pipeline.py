@@ -78,6 +78,8 @@ if TYPE_CHECKING:
 
 _FAR = 3.0
 """Standard deviations by which snapping may change a wave vector without a warning."""
+_UNUSUAL = 0.01
+"""Share of its length, where they are unknown; of the right lattice it was 0.7 % at most."""
 _SAME = 0.01
 """By how much a cell of the same lattice may differ in its vectors and its solid share."""
 _CRITICAL = "load kind negative_before negative_after"
@@ -232,11 +234,9 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         is_same = np.abs(steps - np.rint(steps)).max() < _SAME > abs(abs(np.linalg.det(steps)) - 1)
         if self.case.homogenization.mesh is None and not (is_same and abs(share - wanted) < _SAME):
             what = f"{mode.path}: expected modes of the specimen's lattice, solid to {wanted:.1%}"
-            got = (
-                f"a cell with vectors {given.primitive.round(4).tolist()} mm, solid to {share:.1%}"
-            )
+            got = f"vectors {given.primitive.round(4).tolist()} mm, solid to {share:.1%}"
             remedy = "compute them for this specimen, or give a mesh of another body"
-            raise InputError(f"{what}, got modes of {got}; {remedy}")
+            raise InputError(f"{what}, got modes of a cell with {got}; {remedy}")
         return given
 
     @cached_property
@@ -354,10 +354,11 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             own = self.result.ansatz.modes[k]
             part = slice(first, first := first + own.family.size)
             off = mode.deviation(own, parameters.covariance[part, part])
-            if parameters.by_model_error is not None and off > _FAR:
-                change = f"{mode.wave_change.max():.2%}, {off:.1f} of its standard deviations"
+            change, is_known = mode.wave_change.max(), parameters.by_model_error is not None
+            if off > _FAR if is_known else change > _UNUSUAL:
+                by = f"{change:.2%}" + f", {off:.1f} of its standard deviations" * is_known
                 warnings.append(f"phi{k + 1}: snapping to the lattice changed a wave vector by "
-                                f"{change}: is this mode of this lattice?")  # fmt: skip
+                                f"{by}: is this mode of this lattice?")  # fmt: skip
         return tuple(warnings)
 
     @property
