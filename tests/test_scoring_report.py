@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_benchmark as made
+from explored import content_of, quantity
 from html_page import Page
 from numpy.typing import NDArray
 from synthetic_benchmark import PIXEL, STRAIN
@@ -148,6 +149,22 @@ def test_the_page_is_whole_and_loads_nothing(command: tuple[Path, str, int]) -> 
         assert page.ids[name] == 1
     for n in range(3):
         assert all(page.ids[f"{kind}-{n}"] == 1 for kind in ("length", "x", "y"))
+
+
+def test_errors_can_be_explored(command: tuple[Path, str, int], truth: BenchmarkTruth) -> None:
+    content = content_of((command[0] / "out" / "report.html").read_text("utf-8"))
+    assert [s["label"] for s in content["states"]] == ["good", "fair", "sparse"]
+    for k, sd in enumerate((0.01, 0.1, 0.001)):
+        error = quantity(content, k, "x") / PIXEL
+        assert np.nanstd(error) == pytest.approx(sd, rel=0.15)
+        both = quantity(content, k, "ux") - quantity(content, k, "ux", "truth")
+        assert np.nanmax(np.abs(both - PIXEL * error)) < 1e-9
+    # Where every pixel is next to a measured one, the truth is that of its neighbourhood.
+    row, col = np.mgrid[: content["rows"], : content["cols"]]
+    spacing = PIXEL * content["factor"]
+    x, y = content["x0"] + spacing * col, content["y0"] - spacing * row
+    true = truth.displacement(STRAIN, x.ravel(), y.ravel())[:, 0].reshape(x.shape)
+    assert np.nanmax(np.abs(quantity(content, 0, "ux", "truth") - true)) < 0.3 * PIXEL
 
 
 @pytest.mark.usefixtures("unrendered_pictures")

@@ -1,11 +1,14 @@
 """Three DIC codes from PyPI, the whole displacement and micromorphic IDIC on a benchmark, scored.
 
 Run: benchmarks/score_codes/run [--specimen paper|plate] [--pixel-size 0.02] [--strain 0.128]
-     [--only CODE ...]
+     [--only CODE ...] [--standard DIR [--cases CASE ...]]
 
 Each code gets the public folder and nothing else: the 8-bit images, the mask, benchmark.json. Each
 returns a file, as anybody's would be, and 'modeharvest score' grades the files. All of it stays in
 out/score_codes, with the report. The specimens: the paper's, with 60 holes, and a plate with one.
+
+--standard: instead, the cases of a set that 'modeharvest benchmark standard --out DIR' made, and
+their leaderboard; fields that are there already are kept, so it can be interrupted.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +43,11 @@ from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.report.grades import grading_report
 from modeharvest.report.model import print_report
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
+from modeharvest.runs.benchmark.standard import leaderboard
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.measure import measure
 from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.files import read_json
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE.parents[1] / "out" / "score_codes"
@@ -184,8 +190,37 @@ SPECIMENS = {"paper": 0.128, "plate": 0.06}
 """With the nominal strain at which they are measured."""
 
 
+OTHER_SPECIMENS = ("ligaments-thick", "ligaments-thin", "irregular", "plate")
+"""Cases of the standard set without the paper's lattice, which two of the codes know."""
+
+
+def standard(public: Path, arguments: argparse.Namespace) -> None:
+    """Have every code measure the cases of a standard set; leaves a leaderboard."""
+    handed_in, cases = OUT / "standard" / "codes", read_json(public / "summary.json")["cases"]
+    for case, code in product(arguments.cases or cases, arguments.only or CODES):
+        field = handed_in / code / f"{case}.csv"
+        if field.exists() or (CODES[code] in (idic, whole) and case in OTHER_SPECIMENS):
+            continue
+        begin = time.perf_counter()
+        try:
+            task = Task.read(public / case, cases[case]["nominal_strain"])
+            CODES[code](task, field, arguments.codes)
+        except (RuntimeError, InputError, MissingDependencyError, subprocess.TimeoutExpired) as e:
+            field.unlink(missing_ok=True)
+            print(f"{case}, {code}: failed: {e}", flush=True)
+            continue
+        print(f"{case}, {code}: {time.perf_counter() - begin:.1f} s", flush=True)
+    board = leaderboard(handed_in, truth_folder(public), OUT / "standard" / "graded")
+    for row in board["codes"]:
+        rms = {case: round(numbers["rms_px"], 4) for case, numbers in row["cases"].items()}
+        print(f"{row['code']}: {row['rms_px']:.3g} px over {row['counted']} cases: {rms}")
+
+
 def main() -> None:
     arguments = _arguments()
+    if arguments.standard is not None:
+        standard(arguments.standard, arguments)
+        return
     case, is_plate = Case.read("paper-virtual"), arguments.specimen == "plate"
     imaging = replace(case.imaging, pixel_size=arguments.pixel_size)
     case = case.model_copy(
@@ -224,6 +259,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--pixel-size", type=float, default=0.02, help="[mm/px]")
     parser.add_argument("--strain", type=float, help="of the paper's: 0.078 or 0.128")
     parser.add_argument("--only", nargs="+", choices=list(CODES), help="only these codes")
+    parser.add_argument("--standard", type=Path, metavar="DIR", help="a standard set's folder")
+    parser.add_argument("--cases", nargs="+", help="only these of the standard set")
     parser.add_argument("--codes", required=True, help=argparse.SUPPRESS)
     return parser.parse_args()
 

@@ -12,17 +12,13 @@ loading or imperfection that it could be computed from. The set's id is a digest
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib import resources
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,7 +26,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.field import LocalField, read_field
-from modeharvest.idic.local.tables import TEXTS, read_mat
+from modeharvest.idic.local.tables import claimed_benchmark
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.mapping.isoparametric import locate
@@ -262,7 +258,6 @@ _OPTIONS = {
     "give y_axis='up' or 'down'": "give --y-axis up or down",
     "name them in columns": "say which of them by --column, as u=disp_x",
 }
-_ID = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -277,7 +272,7 @@ class Declared:
     units: str | None = None
     displacement_units: str | None = None
     y_axis: str | None = None
-    first_pixel: int = 0
+    first_pixel: int | None = None
     columns: Mapping[str, str | int] | None = None
 
 
@@ -306,22 +301,3 @@ def read_measured(
         for argument, option in _OPTIONS.items():
             message = message.replace(argument, option)
         raise InputError(message) from error
-
-
-def claimed_benchmark(path: Path) -> str | None:
-    """The id that a file itself says it belongs to; None if it says none or can't be read."""
-    suffix, text, what = path.suffix.lower(), "", "a displacement field"
-    with suppress(InputError), disk.reading(path, what):  # who reads the field says what is wrong
-        if suffix in TEXTS:
-            with path.open(encoding="utf-8", errors="replace") as file:
-                text = "".join(line for line in islice(file, 50) if line[0] in "#%")
-        elif suffix == ".npz":
-            with path.open("rb") as stream:
-                text = f"benchmark {np.load(stream, allow_pickle=False)['benchmark']}"
-        elif h5py.is_hdf5(path):
-            with disk.open_hdf5(path, what) as file:
-                text = f"benchmark {file.attrs['benchmark']}"
-        elif suffix == ".mat":
-            text = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
-    found = _ID.search(text)
-    return found.group(1).lower() if found else None

@@ -78,7 +78,7 @@ class FieldPoints:
 CAUSES = ("bound", "det F", "curvature", "least")
 """Each with all that stand before it."""
 HESSIAN_CORRECTED = "hessian"
-"""2 H⁻¹MH⁻¹: :func:`~modeharvest.idic.uncertainty.covariance.hessian_corrected_covariance`."""
+"""2 H⁻¹MH⁻¹: :func:`~modeharvest.idic.uncertainty.covariance.covariance`."""
 COVARIANCES = (*CAUSES, HESSIAN_CORRECTED)
 _NORMAL_95 = 1.959964
 """Half the width of a 95 % interval [standard deviations]."""

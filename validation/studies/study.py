@@ -231,7 +231,7 @@ A = TypeVar("A")
 
 
 class Study(ABC, Generic[A]):
-    """A question, as options in a frozen dataclass; see docs/studies.md for one's own."""
+    """A question, as options in a frozen dataclass; see docs/how-to/studies.md for one's own."""
 
     question: ClassVar[str]
     """What is asked, for the report."""

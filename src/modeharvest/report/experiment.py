@@ -18,10 +18,11 @@ from modeharvest.idic.spectra.pattern import REFERENCE_MODE, WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.sensor import Sensor
+from modeharvest.report.explore import KnownFields, explored_fits
 from modeharvest.report.figures import fits
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import draw_eigenvalues, draw_load
-from modeharvest.report.figures.maps import ColourScale, draw_field, draw_image
+from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field, draw_image
 from modeharvest.report.figures.whole_field import WholeMaps, whole_panel_numbers
 from modeharvest.report.model import (
     Card,
@@ -39,7 +40,6 @@ from modeharvest.report.model import (
     percent,
     text_of,
 )
-from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import headings
 from modeharvest.validation.summary import SnapshotSummary
 from modeharvest.validation.truth import Comparison, lengths, pattern_field
@@ -153,8 +153,8 @@ def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
     """The length of one of the comparison's vector fields."""
 
     def draw(state: SnapshotState) -> Figure:
-        field: FloatArray = getattr(state.comparison, name)
-        return fits.draw_length(state, state.view.map_frame().average(lengths(field)))
+        length = lengths(getattr(state.comparison, name))
+        return fits.draw_length(state, state.view.map_frame().average(length))
 
     return draw
 
@@ -223,9 +223,16 @@ def experiment_report(summary: Summary, data: ExperimentData | None = None) -> R
         },
         versions=summary.get("versions", {}),
         hero=_hero(data) if data is not None else None,
+        explore=None if data is None else partial(explored_fits, states, _known),
         hero_caption=text_of("experiment-hero", state=states[-1].label if states else ""),
         **caption("page-experiment", seeds=", ".join(seeds)),
     )
+
+
+def _known(state: SnapshotState) -> KnownFields:
+    c, wholes = state.comparison, state.data.wholes
+    whole = wholes[state.k][0].measured if wholes else None
+    return KnownFields(c.displacement, c.best, whole, partial(MapFrame.sample, field=c.residual))
 
 
 def critical_line(strain: float | None, material: Mapping[str, Any] | None) -> str:
@@ -345,11 +352,10 @@ def _parameter(mode: Mapping[str, Any], k: int) -> list[Cell]:
 
 def experiment_figures(data: ExperimentData) -> list[ReportFigure]:
     """The figures that :func:`experiment_report` refers to, before there is a summary."""
-    panels = snapshot_panels(data.modes)
     cards = [
         *_path_cards(data.solution),
         *(fits.convergence_card(state) for state in data.states),
-        *(panel.card(data.states, lambda key, state: "") for panel in panels),
+        *(p.card(data.states, lambda key, state: "") for p in snapshot_panels(data.modes)),
     ]
     return [_hero(data), *(figure for card in cards for figure in card.figures)]
 

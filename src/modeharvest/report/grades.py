@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from modeharvest.report.explore import explored_scores
 from modeharvest.report.figures import maps, style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above, plain_ticks
@@ -77,7 +78,7 @@ class ErrorMaps:
     graded: Score
 
     @cached_property
-    def _nearest(self) -> NDArray[np.intp]:
+    def nearest(self) -> NDArray[np.intp]:
         """(rows, cols) of the map: number of the nearest point, the count of all if too far."""
         graded, grid = self.graded, self.map_frame.grid
         if not len(graded.x):
@@ -89,12 +90,11 @@ class ErrorMaps:
         return np.asarray(tree.query(pixels, distance_upper_bound=reach)[1])
 
     def _draw(self, values: FloatArray, scale: maps.ColourScale) -> Figure:
-        return maps.draw_field(self.map_frame, np.append(values, np.nan)[self._nearest], scale)
+        return maps.draw_field(self.map_frame, np.append(values, np.nan)[self.nearest], scale)
 
     def draw_length(self, scale: maps.ColourScale) -> Figure:
-        """Draw the error's length."""
-        length = np.maximum(_error_length(self.graded), 1e-3 * scale.low)  # 0 has no logarithm
-        return self._draw(length, scale)
+        """Draw the error's length; 0 has no logarithm."""
+        return self._draw(np.maximum(_error_length(self.graded), 1e-3 * scale.low), scale)
 
     def draw_component(self, component: int) -> Figure:
         """Draw the error along x (0) or y (1), on a scale of its own."""
@@ -208,8 +208,8 @@ def grading_report(grading: Grading) -> Report:
                        "score-maps"),
         ],
         warnings=grading.notes,
-        hero=ReportFigure("best", "Length of the best one’s error",
-                          partial(drawn[0].draw_length, scale)),
+        explore=partial(explored_scores, grading, lambda at, s: ErrorMaps(at, s).nearest),
+        hero=ReportFigure("best", "Length of the error", partial(drawn[0].draw_length, scale)),
         hero_caption=f"Length of the error of {best.source}.",
         **caption("page-scores", what=what, strain=grading.strain),
     )  # fmt: skip

@@ -125,7 +125,7 @@ def proof(critical: Mapping[str, Any]) -> str:
         text = f"negative eigenvalues a millionth below: {below}, above: {above}"
     others = len(critical["earlier"])
     return text + (f"; but {others} other waves are unstable before" if others else
-                   "; no other wave of the grid is unstable before")  # fmt: skip
+                   "; no other wave that was looked at is unstable before")  # fmt: skip
 
 
 def findings(summary: Summary) -> list[str]:

@@ -10,8 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.report.explore import explored_images
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field, draw_image
+from modeharvest.report.figures.sequence import force_cards
 from modeharvest.report.model import (
     Card,
     KeyNumber,
@@ -66,9 +68,14 @@ def measure_report(
             *([] if by_contours else [KeyNumber.of("cutoff", last=last)]),
             KeyNumber.of("coverage-of-material", number(100 * last["coverage"], 4)),
         ],
-        sections=[*maps, Section.of("numbers", Card.tabular(table, wide=True))],
+        sections=[
+            *maps,
+            Section.of("timeline", force_cards(images, "strain_x", "mean strain along x")),
+            Section.of("numbers", Card.tabular(table, wide=True)),
+        ],
         warnings=[
             *summary["warnings"],
+            *(f"not used: {row['name']}: {row['reason']}" for row in summary["skipped"]),
             *(f"{i['name']}: {text}" for i in images for text in i["warnings"]),
         ],
         notes=[
@@ -77,12 +84,7 @@ def measure_report(
             *summary["notes"],
         ],
         command=summary["command"],
-        files={
-            "results/*.h5": "nodes, displacement, standard deviations (HDF5)",
-            "results/*.vtu": "the same with strains, for ParaView",
-            "results/*.csv": "the same as a table of the nodes",
-            "results/*.tif": "u, v and their standard deviations at every pixel (float32)",
-        },
+        explore=partial(explored_images, results, summary["unit"], residual) if results else None,
         versions=summary["versions"],
         **caption("page-measure"),
     )  # fmt: skip

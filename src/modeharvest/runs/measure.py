@@ -16,7 +16,7 @@ the middle of the image, x right, y up.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -59,7 +59,15 @@ from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
 from modeharvest.imaging.photographs.photograph import Photograph, read_frame, read_reference
-from modeharvest.runs.photographs.prepare import CODE, LIBRARIES, named_files
+from modeharvest.runs.photographs.machine_log import LogTable
+from modeharvest.runs.photographs.prepare import CODE, LIBRARIES
+from modeharvest.runs.photographs.sequence import (
+    ChosenFrames,
+    FrameChoice,
+    chosen_frames,
+    named_files,
+    recorded_with,
+)
 from modeharvest.runs.whole_field import BYTES_PER_PIXEL
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError, require_within
@@ -72,7 +80,7 @@ from modeharvest.util.files import (
     write_json,
 )
 from modeharvest.util.machine import require_memory
-from modeharvest.util.progress import Progress, counted, silent
+from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import picked
 
@@ -91,7 +99,8 @@ class MeasureCase:
     ``mask``: an image, not black on material of the reference; None to find it by its speckle.
     ``pixel_size`` [mm]; None for lengths in px. ``mesh``: of the material, of T3 or T6 elements, a
     file that meshio reads; None to make it from the mask. ``brightness``: degree of the polynomials
-    by which gain and offset of an image may vary, 0 to 6.
+    by which gain and offset of an image may vary, 0 to 6. ``sequence``: the files that the names
+    stand for, if they are of folders or videos; ``choice``: the command's options about them.
     """
 
     reference: Path
@@ -100,6 +109,8 @@ class MeasureCase:
     pixel_size: float | None = None
     mesh: Path | None = None
     brightness: int = 0
+    sequence: ChosenFrames | None = None
+    choice: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         Brightness(self.brightness, self.brightness)  # checks its degree
@@ -112,7 +123,8 @@ class MeasureCase:
     @property
     def files(self) -> dict[str, Path]:
         """The deformed images by their names, in the order of the test."""
-        return {path.stem: path for path in named_files(Path(), self.deformed)}
+        paths = self.sequence.deformed if self.sequence else named_files(Path(), self.deformed)
+        return {path.stem: path for path in paths}
 
     @property
     def unit(self) -> str:
@@ -231,30 +243,46 @@ class MeasureRun(StagedRun[MeasureCase]):
         frame = read_frame(self.case.files[name], self.reference)
         return ImagePair(self.reference.image, frame.image, self.grid, self.material.mask)
 
-    def results(self) -> dict[str, NodalResult]:
-        """Measure every image, each after the one before; leaves ``results/``."""
-        files, key = self.case.files, self._key
-        for path in files.values():  # what is wrong with one is known before the first is measured
-            read_frame(path, self.reference)
-        found: dict[str, NodalResult] = {}
-        for name in counted(tuple(files), self.progress, "measure images"):
-            key = digest([key, name, sha256_of(files[name])])
-            found[name] = self._result(name, key, next(reversed(found.values()), None))
+    def results(self) -> Mapping[str, NodalResult]:
+        """Measure every image, each after the last one that could be; leaves ``results/``.
+
+        Raises InputError if none can.
+        """
+        found, failed = self._found
+        if not found:
+            raise InputError(next(iter(failed.values())))
         return found
 
-    def _result(self, name: str, key: str, before: NodalResult | None) -> NodalResult:
+    @cached_property
+    def _found(self) -> tuple[Mapping[str, NodalResult], dict[str, str]]:
+        """What was measured, and why others could not be."""
+        files, key, keys = self.case.files, self._key, {}
         folder, given = self.folder / "results", Given(self.case.unit)
-        tables = [folder / f"{name}.{kind}" for kind in ("h5", "vtu", "csv")]
+        _ = self.material  # what is wrong with the reference is not a deformed image's fault
+        for name, path in files.items():
+            require_file(path, "an image", "check its name")
+            keys[name] = key = digest([key, name, sha256_of(path)])
 
-        def work() -> tuple[Path, ...]:
-            found, *holes = self._measured(name, before, folder)
-            write_result(tables[0], found, given)
-            write_vtu(tables[1], found, given)
-            write_csv(tables[2], found, given=given)
-            return *tables, *holes, *write_maps(folder / name, found, given=given)
+        def tables(name: str) -> list[Path]:
+            return [folder / f"{name}.{kind}" for kind in ("h5", "vtu", "csv")]
 
-        self.do(f"image {name}", key, work)
-        return read_result(tables[0])
+        def work(
+            name: str, last: tuple[str, NodalResult] | None
+        ) -> tuple[Sequence[Path], dict[str, Any]]:
+            self.progress(list(files).index(name), len(files), "measure images")
+            found, *holes = self._measured(name, last and last[1], folder)
+            paths = tables(name)
+            write_result(paths[0], found, given)
+            write_vtu(paths[1], found, given)
+            write_csv(paths[2], found, given=given)
+            return (*paths, *holes, *write_maps(folder / name, found, given=given)), {}
+
+        def read(name: str, _: dict[str, Any]) -> NodalResult:
+            return read_result(tables(name)[0])
+
+        found = self.do_in_turn("image", keys, folder, work, read)
+        self.progress(1, 1, "measure images")
+        return found
 
     def _measured(
         self, name: str, before: NodalResult | None, folder: Path
@@ -301,7 +329,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             write_json(self.folder / "summary.json", summary)
         return summary
 
-    def _summary(self, results: dict[str, NodalResult]) -> dict[str, Any]:
+    def _summary(self, results: Mapping[str, NodalResult]) -> dict[str, Any]:
         case = self.case
         return {
             "title": f"Displacement from {case.reference.name}",
@@ -310,7 +338,7 @@ class MeasureRun(StagedRun[MeasureCase]):
                 + [f"--mask {case.mask}"] * (case.mask is not None)
                 + [f"--pixel-size {case.pixel_size:g}" for _ in [0] if case.pixel_size]
                 + [f"--mesh {case.mesh}"] * (case.mesh is not None)
-                + [f"--brightness {case.brightness}"] * (case.brightness > 0)
+                + [f"--brightness {case.brightness}"] * (case.brightness > 0) + [*case.choice]
                 + [f"--out {self.folder}"]
             ),
             "unit": case.unit,
@@ -320,8 +348,12 @@ class MeasureRun(StagedRun[MeasureCase]):
             "mask": "given" if not case.mask is case.mesh is None
             else "found by its speckle" if self.plain is None
             else "found by its grey level",
-            "notes": list(self.reference.notes),
+            "notes": [*self.reference.notes, *(case.sequence.notes if case.sequence else ())],
             "warnings": list(self.material.changes),
+            "skipped": [
+                {"name": name, "reason": reason} for name, reason in (
+                    *(case.sequence.skipped if case.sequence else ()), *self._found[1].items())
+            ],
             "images": [self._image(name, result) for name, result in results.items()],
             "versions": versions(*LIBRARIES),
         }  # fmt: skip
@@ -332,6 +364,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         inside = u[mask & np.isfinite(u).all(axis=-1)] / px
         numbers = {
             "name": name,
+            "file": str(self.case.files[name]),
+            **recorded_with(self.case.sequence, name),
+            **_mean_motion(result),
             "rms_px": float(np.sqrt(np.mean(inside**2))),
             "max_px": float(np.linalg.norm(inside, axis=-1).max()),
             "median_sd_px": float(np.median(result.standard_deviation)) / px,
@@ -356,6 +391,19 @@ class MeasureRun(StagedRun[MeasureCase]):
         }
 
 
+def _mean_motion(result: NodalResult) -> dict[str, float]:
+    """Mean strain along the material's x and y [-], tension positive, and rotation [degrees].
+
+    Of the affine motion nearest to the nodes' displacement, whose rotation is no strain.
+    """
+    points = result.mesh.nodes
+    columns = np.column_stack([np.ones(len(points)), points])
+    F = np.eye(2) + np.linalg.lstsq(columns, result.displacement, rcond=None)[0][1:].T
+    along, up = np.linalg.norm(F, axis=0) - 1.0
+    turned = np.degrees(np.arctan2(F[1, 0] - F[0, 1], F[0, 0] + F[1, 1]))
+    return {"strain_x": float(along), "strain_y": float(up), "rotation_deg": float(turned)}
+
+
 def measure(
     reference: Path | str,
     deformed: Sequence[Path | str],
@@ -365,15 +413,27 @@ def measure(
     pixel_size: float | None = None,
     mesh: Path | str | None = None,
     brightness: int = 0,
+    choice: FrameChoice | None = None,
+    log: LogTable | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
 
+    ``deformed`` may also be folders and videos; ``choice`` among their frames; ``log`` of the
+    testing machine.
+
     Leaves its files in ``folder`` and returns what ``summary.json`` holds. InputError if an image,
     the mask or the mesh can't be used.
     """
+    names, choice, log = tuple(map(str, deformed)), choice or FrameChoice(), log or LogTable()
+    sequence = chosen_frames(
+        Path(), str(reference), names, choice, log, Path(folder), progress
+    )  # fmt: skip
+    flags = [f"--every {choice.every}"] * (choice.every > 1)
+    flags += [f"--log {log.file}"] * bool(log.file)
     case = MeasureCase(
-        Path(reference), tuple(map(str, deformed)), None if mask is None else Path(mask),
-        pixel_size, None if mesh is None else Path(mesh), brightness,
+        sequence.reference, names, None if mask is None else Path(mask),
+        pixel_size, None if mesh is None else Path(mesh), brightness, sequence,
+        tuple(flags),
     )  # fmt: skip
     return MeasureRun(case, Path(folder), progress).all()

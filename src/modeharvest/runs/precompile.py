@@ -85,6 +85,13 @@ def _stamp(stage: str) -> Path | None:
     return None if folder is None else folder / f"precompiled-{sources()}.nbi"
 
 
+def stamps() -> dict[str, float]:
+    """By stage, what compiling its kernels ahead took [s]; 0 where that hasn't been done."""
+    found = {stage: _stamp(stage) for stage in _PARTS}
+    texts = {s: p.read_text() if p is not None and p.exists() else "" for s, p in found.items()}
+    return {stage: float(text or 0.0) for stage, text in texts.items()}
+
+
 def _is_missing(stage: str) -> bool:
     return (stamp := _stamp(stage)) is not None and not stamp.exists()
 
@@ -127,11 +134,12 @@ def _main(stages: list[str]) -> None:
     if hasattr(os, "nice"):
         os.nice(10)  # the finite elements go first
     for stage in stages:
+        begin = time.perf_counter()
         _PARTS[stage][0]()
         if (stamp := _stamp(stage)) is not None:
             for old in stamp.parent.glob("precompiled-*.nbi"):
                 old.unlink(missing_ok=True)
-            stamp.touch()
+            stamp.write_text(f"{time.perf_counter() - begin:.1f}")  # for `modeharvest doctor`
 
 
 if __name__ == "__main__":

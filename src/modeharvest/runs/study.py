@@ -1,7 +1,7 @@
 """A study from its case to its report, in one folder in which an interrupted run is continued.
 
-Its files: docs/studies.md. Its TOML file has the tables of a virtual experiment and ``[study]``,
-with a kind ("robustness", "noise", "systematic", "modes" or "resolution") and that kind's options.
+Its files: docs/how-to/studies.md. Its TOML file has the tables of a virtual experiment and
+``[study]``: a kind ("robustness", "noise", "systematic", "modes", "resolution"), its options.
 In Python: ``StudyCase(study=RobustnessStudy(initial_guesses=20, radius=0.2))``.
 """
 
@@ -173,7 +173,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
     def _summary(
         self, campaign: Campaign, table: pd.DataFrame, findings: Findings
     ) -> dict[str, Any]:
-        """The content of ``summary.json``; for its keys see docs/studies.md."""
+        """The content of ``summary.json``; for its keys see docs/how-to/studies.md."""
         failed = table[table["error"] != ""]
         return {
             "title": self.case.title or self.case.kind.capitalize(),

@@ -1,7 +1,7 @@
 """The analysis of an infinite lattice in one folder, in stages that can be resumed.
 
-Their files: docs/bloch.md. ``modeharvest bloch`` is the first two and the report, ``modeharvest
-modes`` all of them.
+Their files: docs/explanation/bloch.md. ``modeharvest bloch`` is the first two and the report,
+``modeharvest modes`` all of them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the analysis of a lattice found: its result types, and their ``summary.json``.
 
-Keys of the latter: docs/bloch.md.
+Keys of the latter: docs/explanation/bloch.md.
 """
 
 from __future__ import annotations

@@ -154,7 +154,8 @@ def score(
     def grade(path: Path, declared: Declared) -> tuple[scoring.Score, tuple[str, ...]]:
         field = read_measured(path, grid, known.id, declared)
         graded = scoring.score(field, true(field.x, field.y), labels, grid, reach_px)
-        return graded, check_conventions(field, true, grid)[1]
+        notes = check_conventions(field, true, grid)[1]
+        return graded, (field.read_as, *notes) if field.convention else notes
 
     graded, refused = _graded(every, grade, progress, "score")
     best_first = tuple(scoring.ranked([one for one, _ in graded]))
@@ -220,20 +221,14 @@ def declarations(
     if not set(first) <= {None, 0, 1}:
         raise InputError(f"expected --first-pixel 0 or 1, got {', '.join(map(str, first))}")
     roles = dict(map(_column, columns or ()))
-    each = zip(
-        paths,
-        _each(names, paths, "--name"),
-        _each(units, paths, "--unit"),
-        _each(y_axes, paths, "--y-axis"),
-        first,
-        strict=True,
-    )
+    options = ((names, "--name"), (units, "--unit"), (y_axes, "--y-axis"))
+    each = zip(paths, *(_each(given, paths, name) for given, name in options), first, strict=True)
     return {
         path: Declared(
             name=name,
             units=None if unit == "file" else unit,
             y_axis=None if y_axis == "file" else y_axis,
-            first_pixel=pixel or 0,
+            first_pixel=pixel,
             columns=roles,
         )
         for path, name, unit, y_axis, pixel in each

@@ -1,0 +1,202 @@
+"""Folders to share as RO-Crates: what every file is, its checksum, licence, software and command.
+
+An RO-Crate (https://w3id.org/ro/crate/1.1) is a folder with ``ro-crate-metadata.json``, JSON-LD in
+schema.org's words, which archives such as Zenodo and search engines read.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import mimetypes
+import os
+import time
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from modeharvest.util import __version__
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
+from modeharvest.util.stages import digest
+from modeharvest.validation.scoring.benchmark import SECRETS
+from modeharvest.validation.scoring.benchmark import SIDECAR as BENCHMARK
+
+METADATA = "ro-crate-metadata.json"
+PROFILE = "https://w3id.org/ro/crate/1.1"
+PAPER = "https://doi.org/10.1016/j.ijsolstr.2024.112916"
+LICENCES = {
+    "CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/",
+    "CC0-1.0": "https://creativecommons.org/publicdomain/zero/1.0/",
+}
+_TEMPORARY = (".*", "*.part", "*.log", "__pycache__")
+_KINDS = {".tif": "image/tiff", ".h5": "application/x-hdf5", ".vtu": "application/xml"}
+"""Of files whose kind Python doesn't know."""
+_UNITS = {"mm": "mm", "px": "px", "percent": "%", "N": "N", "MPa": "MPa", "deg": "degree"}
+
+
+def write_crate(
+    folder: Path | str, licence: str = "CC-BY-4.0", author: str = "", name: str = ""
+) -> dict[str, Any]:
+    """Describe a finished folder in ``ro-crate-metadata.json``; returns its content.
+
+    folder : of a benchmark set, a harvest, a study or any other run: with ``benchmark.json`` or
+        ``summary.json``. Hidden files and logs are left out.
+    licence : one of :data:`LICENCES`, or an address; a set's own counts.
+    author : who made it, "Name" or "Name <https://orcid.org/...>".
+    name : title; the folder's own by default.
+
+    Raises InputError if the folder is none of these, or a public set holds what tells its truth.
+    """
+    folder = Path(folder)
+    info = _described(folder)
+    licence = str(info.get("licence", licence))
+    address = LICENCES.get(licence, licence)
+    if not address.startswith("https://"):
+        known = ", ".join(LICENCES)
+        raise InputError(f"expected a licence ({known}) or its https:// address, got {licence!r}")
+    require_writable(folder)
+    files = [_file(folder, path) for path in _members(folder)]
+    software = {"modeharvest": __version__, **info.get("versions", {})}
+    made = [_software(library, version) for library, version in software.items()]
+    title = name or str(info.get("title") or f"Benchmark {info.get('id', folder.name)}")
+    units = list(_quantities(info))
+    person, _, orcid = author.partition("<")
+    at = orcid.strip(" >") or "#author"
+    people = [_entity("Person", at, name=person.strip())] if person.strip() else []
+    root = {
+        **_entity("Dataset", "./", name=title, description=_description(info)),
+        "datePublished": _now(),
+        "license": {"@id": address},
+        "citation": {"@id": PAPER},
+        "isAccessibleForFree": True,
+        "author": [_to(person) for person in people],
+        "hasPart": [_to(file) for file in files],
+        "variableMeasured": [_to(unit) for unit in units],
+        "mentions": {"@id": "#made"},
+    }
+    command = str(info.get("command") or f"made with modeharvest {__version__}")
+    action = _entity("CreateAction", "#made", name=command, description=command)
+    action |= {"instrument": [_to(library) for library in made], "result": {"@id": "./"}}
+    about = {"conformsTo": {"@id": PROFILE}, "about": {"@id": "./"}}
+    content = {
+        "@context": [f"{PROFILE}/context", {"sha256": "https://schema.org/sha256"}],
+        "@graph": [
+            {**_entity("CreativeWork", METADATA), **about},
+            root,
+            *files,
+            *units,
+            *people,
+            *made,
+            action,
+            _entity("CreativeWork", address, name=licence),
+            _entity("ScholarlyArticle", PAPER, name="S. Maraghechi et al., the method"),
+        ],
+    }
+    write_json(folder / METADATA, content)
+    return content
+
+
+def verify(folder: Path | str) -> list[str]:
+    """Faults of a crate, in sentences: files missing, changed, not listed; a set's id.
+
+    Raises InputError if the folder has no ``ro-crate-metadata.json`` that can be read.
+    """
+    folder, content = Path(folder), read_json(Path(folder) / METADATA)
+    try:
+        graph = {str(entity["@id"]): entity for entity in content["@graph"]}
+        listed = {part["@id"]: graph[part["@id"]] for part in graph["./"]["hasPart"]}
+        faults = [fault for name, entry in listed.items() if (fault := _fault(folder, name, entry))]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"expected an RO-Crate written by modeharvest in {folder / METADATA}, got one without "
+            f"{error}; make it again with 'modeharvest share'"
+        ) from error
+    names = {path.relative_to(folder).as_posix() for path in _members(folder)}
+    faults += [f"{name}: not listed in {METADATA}" for name in sorted(names - set(listed))]
+    if (folder / BENCHMARK).is_file() and "files" in (info := read_json(folder / BENCHMARK)):
+        for name, entry in info["files"].items():
+            if (folder / name).is_file() and sha256_of(folder / name) != entry["sha256"]:
+                faults.append(f"{name}: not the image of {BENCHMARK}")
+        if digest(info["files"])[:12] != info["id"]:
+            faults.append(f"{BENCHMARK}: the id {info['id']} isn't that of its files")
+    return faults
+
+
+def _fault(folder: Path, name: str, entry: Mapping[str, Any]) -> str:
+    """What is wrong with a listed file, or nothing."""
+    path = folder / name
+    if folder.resolve() not in path.resolve().parents:
+        return f"{name}: lies outside the folder"
+    if not path.is_file():
+        return f"{name}: missing"
+    return "" if sha256_of(path) == entry["sha256"] else f"{name}: changed (SHA-256)"
+
+
+def _described(folder: Path) -> dict[str, Any]:
+    """What a folder says of itself; InputError if it is no finished run, or tells a truth."""
+    if (folder / BENCHMARK).is_file():
+        info = dict(read_json(folder / BENCHMARK))
+        secrets = [p.name for pattern in SECRETS for p in sorted(folder.glob(pattern))]
+        if "files" in info and secrets:
+            raise InputError(
+                f"expected a public folder without truth, got {secrets[0]} in {folder}"
+            )
+        return info
+    if (folder / "summary.json").is_file():
+        return dict(read_json(folder / "summary.json"))
+    raise InputError(
+        f"expected a finished run or a benchmark set in {folder}, got neither summary.json nor "
+        f"{BENCHMARK}; give the folder of --out"
+    )
+
+
+def _members(folder: Path) -> Iterator[Path]:
+    """The files to share."""
+    for path in sorted(folder.rglob("*")):
+        parts = path.relative_to(folder).parts
+        hidden = any(fnmatch.fnmatch(part, pattern) for part in parts for pattern in _TEMPORARY)
+        if path.is_file() and not hidden and parts != (METADATA,):
+            yield path
+
+
+def _file(folder: Path, path: Path) -> dict[str, Any]:
+    known = _KINDS.get(path.suffix) or mimetypes.guess_type(path.name)[0]
+    kind, size = known or "application/octet-stream", str(path.stat().st_size)
+    at, digits = path.relative_to(folder).as_posix(), sha256_of(path)
+    return _entity("File", at, name=path.name, encodingFormat=kind, contentSize=size, sha256=digits)
+
+
+def _entity(kind: str, at: str, **content: str) -> dict[str, Any]:
+    return {"@id": at, "@type": kind, **content}
+
+
+def _to(entity: Mapping[str, Any]) -> dict[str, str]:
+    return {"@id": entity["@id"]}
+
+
+def _software(name: str, version: object) -> dict[str, Any]:
+    url = "https://www.python.org" if name == "python" else f"https://pypi.org/project/{name}"
+    return _entity("SoftwareApplication", f"#{name}", name=name, version=str(version), url=url)
+
+
+def _quantities(info: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Numbers whose names end in their unit."""
+    for key, value in info.items():
+        unit = _UNITS.get(key.rpartition("_")[2])
+        if unit and isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield {**_entity("PropertyValue", f"#{key}", name=key, unitText=unit), "value": value}
+
+
+def _description(info: Mapping[str, Any]) -> str:
+    """One paragraph; lengths in images are in px, others in mm, x to the right and y up."""
+    what = "Speckle images for any DIC code; the true displacements are kept apart."
+    if "files" not in info:
+        what = str(info.get("question") or "Results of modeharvest, with a report to read.")
+    return f"{what} Units stand in the names of columns and keys; x to the right, y up."
+
+
+def _now() -> str:
+    """The date, or that of SOURCE_DATE_EPOCH."""
+    seconds = int(os.environ.get("SOURCE_DATE_EPOCH") or time.time())
+    return datetime.fromtimestamp(seconds, UTC).date().isoformat()
