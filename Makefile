@@ -12,7 +12,7 @@ LOOSE := $(addprefix --disable-error-code=,arg-type assignment misc no-any-retur
   operator return-value type-arg union-attr unused-ignore var-annotated)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo lattices test lint test-next bench shipped clean
+.PHONY: help demo docs lattices test lint test-next bench shipped clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | \
@@ -21,11 +21,15 @@ help: ## Show this list
 demo: ## Reproduce the paper's virtual experiment in out/demo (open report.html)
 	$(ENV) modeharvest run paper-virtual --out $(OUT)
 
+docs: ## Build the documentation in docs/_build/html (a minute; the gallery's examples are run)
+	$(ENV) python -m sphinx -b html -W --keep-going -j 2 docs docs/_build/html
+
 lattices: ## Analyse the infinite lattices that are shipped in out/lattices (minutes)
 	for case in square-lattice hexagonal-lattice chiral-lattice mode-study; do \
 	  $(ENV) modeharvest modes $$case --out out/lattices/$$case || exit; done
 
 test: lint ## Lint, type-check and run the tests: all that must pass before a commit
+	-scripts/browser
 	$(ENV) $(PYTEST)
 
 lint: ## Check style, types and the direction of imports
@@ -51,5 +55,5 @@ shipped: ## Make the solution anew that ships with the package
 
 clean: ## Remove what the other commands leave in this folder (not the cache, not out/)
 	rm -rf build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis \
-	  .import_linter_cache .benchmarks
+	  .import_linter_cache .benchmarks docs/_build docs/generated
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

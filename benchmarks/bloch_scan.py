@@ -4,10 +4,10 @@
 zone's boundary, assembly and all, with 60 sparse factorisations of the reduced complex matrix whose
 order of elimination is known, or found anew each time. They take turns in one process, and the
 ratios are medians over the turns.
-``… critical`` prints the table of docs/bloch.md, ``… rates`` the order of convergence on nested
-meshes, ``… splitting`` what a mesh does to a degenerate set, ``… distances`` which branches are
-found from loads that aren't critical, and ``… study`` ten lattices under three loadings with the
-time and the memory they take.
+``… critical`` prints the table of docs/explanation/bloch.md, ``… rates`` the order of convergence
+on nested meshes, ``… splitting`` what a mesh does to a degenerate set, ``… distances`` which
+branches are found from loads that aren't critical, and ``… study`` ten lattices under three
+loadings with the time and the memory they take.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 ``scripts/env python benchmarks/fem_path.py`` prints, for the 6 x 10 and the 12 x 10 specimen, what
 ``simulate`` and the naive loop find, and what they cost in processor time. ``--table`` prints the
-tables of docs/fem.md instead, ``--ranks`` how much faster two MPI ranks are than one.
+tables of docs/explanation/fem.md instead, ``--ranks`` how much faster two MPI ranks are than one.
 Seconds depend on the machine; the ratios, of runs right after one another, hardly do.
 """
 

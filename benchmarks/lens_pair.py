@@ -2,7 +2,7 @@
 
 Such pairs are made in a computer, or by two lenses one of which is ideal. The target doesn't move,
 so all of S is observable, its affine part included: the fit that calibrations rest on is compared
-with a known camera (docs/distortion.md).
+with a known camera (docs/how-to/distortion.md).
 """
 
 from __future__ import annotations

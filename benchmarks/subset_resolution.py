@@ -1,7 +1,8 @@
 """DIC on the star of DIC Challenge 2.0, by subsets or finite elements: theory, and what is found.
 
-pyvale, or whatever ``MODEHARVEST_PYVALE`` names (docs/fields.md), measures the star with subsets of
-several sizes; its fields are graded as anybody's. Theory: l10 by Savitzky and Golay's weights, and
+pyvale, or whatever ``MODEHARVEST_PYVALE`` names (docs/how-to/fields.md), measures the star with
+subsets of several sizes; its fields are graded as anybody's. Theory: l10 by Savitzky and
+Golay's weights, and
 
     n = sqrt(2) s / (w G),   G^2 the mean squared gradient of the speckle along y,
 

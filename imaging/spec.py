@@ -45,7 +45,7 @@ class ImagingSpec:
     on the ideal grid, that of the images once undistorted."""
     affine_distortion: bool = True
     """False takes the distortion's affine part away
-    (:func:`modeharvest.imaging.distortion.lens.without_affine`): it is no more than another pixel
+    (``distortion.lens.without_affine``): it is no more than another pixel
     size, unobservable in images of a target whose shifts are unknown."""
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 The image is prefiltered once, so that the spline passes through every pixel: each line goes through
 a recursive filter, forwards and backwards, once for every pole; the mirrored border makes it exact.
-A sample costs 16, 36 or 144 coefficients. Speckles below 6 px want order 11: docs/metrology.md.
+A sample costs 16, 36 or 144 coefficients. Speckle below 6 px: docs/explanation/metrology.md.
 
 Compilers turn loops over many points into vectors, but here neighbouring points read from places
 that differ; what can go side by side are the taps of a row: the four of a cubic spline as a vector,

@@ -25,6 +25,7 @@ def keys(content: Any) -> Iterator[str]:
 
 def undocumented(summary: dict[str, Any], page: str) -> set[str]:
     """Keys that the page's tables do not have."""
-    lines = (DOCS / page).read_text("utf-8").splitlines()
+    (path,) = DOCS.rglob(page)
+    lines = path.read_text("utf-8").splitlines()
     known = "".join(line for line in lines if line.startswith("|"))
     return {name for name in keys(summary) if f"`{name}`" not in known}

@@ -1,4 +1,4 @@
-"""The examples of docs/distortion.md work as printed."""
+"""The examples of docs/how-to/distortion.md work as printed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibration_set import photographs, random_lens
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
 
-PAGE = (Path(__file__).parents[1] / "docs" / "distortion.md").read_text("utf-8")
+PAGE = (Path(__file__).parents[1] / "docs/how-to/distortion.md").read_text("utf-8")
 SHAPE = (140, 170)
 
 
@@ -36,7 +36,7 @@ def test_the_printed_examples_find_the_lens(tmp_path: Path) -> None:
     shifts = [[0, 0], [20, 2], [-19, 4], [3, 23], [-6, -21]]
     images = photographs(lens, SHAPE, shifts)
     names: dict[str, Any] = {"photographs": images, "folder": tmp_path}
-    exec(compile(calibrate, "docs/distortion.md", "exec"), names)
+    exec(compile(calibrate, "docs/how-to/distortion.md", "exec"), names)
     found = read_distortion(tmp_path / "lens.json")
     assert affine_aside(found, lens, SHAPE).rms_px < 1e-3  # without noise: the splines' errors
 
@@ -44,7 +44,7 @@ def test_the_printed_examples_find_the_lens(tmp_path: Path) -> None:
     nothing = PolynomialDistortion(SHAPE, np.zeros((2, 1)))
     for name, through in (("ideal_image", nothing), ("distorted_image", camera)):
         (names[name],) = photographs(through, SHAPE, [[0, 0]])
-    exec(compile(recover, "docs/distortion.md", "exec"), names)
+    exec(compile(recover, "docs/how-to/distortion.md", "exec"), names)
     at = np.arange(140.0)[:, None], np.arange(170.0)[None, :]
     off = np.stack(names["lens"].distortion.shift(*at)) - np.stack(camera.shift(*at))
     # Splines' errors, and both images are blurred alike although one of them is stretched.

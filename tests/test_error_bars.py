@@ -143,7 +143,7 @@ def test_seeds_of_noise_scatter_as_the_curvature_predicts(model_error: float, sd
         for c in (predicted, np.cov(np.array(ends).T))
     )
     # 19 degrees of freedom over a dozen independent places: 5 %; noise adds some second
-    # order (docs/metrology.md).
+    # order (docs/explanation/metrology.md).
     assert stated == pytest.approx(seen, rel=0.2)
 
 

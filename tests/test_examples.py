@@ -1,10 +1,12 @@
-"""The examples run, are the ones the README shows, and give a right number."""
+"""The examples and the README's lines run, and give a right number."""
 
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -25,10 +27,27 @@ def load(path: Path) -> ModuleType:
     return module
 
 
-def test_readme_shows_the_example_and_it_is_short() -> None:
-    text = EXAMPLE.read_text("utf-8")
-    assert text.rstrip("\n") in (ROOT / "README.md").read_text("utf-8")
-    assert len(text.splitlines()) <= 40
+def test_the_example_is_short_and_a_page_shows_it() -> None:
+    assert len(EXAMPLE.read_text("utf-8").splitlines()) <= 40
+    page = ROOT / "docs/how-to/own_specimen.md"
+    (shown,) = re.findall(r"```\{literalinclude\} (\S+)", page.read_text("utf-8"))
+    assert (page.parent / shown).resolve() == EXAMPLE
+
+
+def test_readme_is_short_and_its_nine_lines_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best fit is no further from the truth than IDIC, and that is near it: as below."""
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert len(readme.splitlines()) <= 150
+    (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert len(code.strip().splitlines()) - code.count("\n\n") <= 9
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    idic, best = (names["pair"].rms(names[fit]) / 0.03 for fit in ("result", "best"))
+    assert best <= idic
+    assert idic**2 - best**2 < 0.35**2
 
 
 @pytest.mark.dolfinx

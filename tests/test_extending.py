@@ -1,4 +1,4 @@
-"""The recipes of docs/extending.md run."""
+"""The recipes of docs/how-to/extending.md run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from modeharvest.fem import materials
 from modeharvest.util.typed import quantities
 
-PAGE = Path(__file__).parents[1] / "docs/extending.md"
+PAGE = Path(__file__).parents[1] / "docs/how-to/extending.md"
 
 
 def run(heading: str) -> dict[str, Any]:

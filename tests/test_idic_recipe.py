@@ -1,4 +1,4 @@
-"""The recipe of docs/idic.md works as printed: a new mode family is recovered from images."""
+"""The recipe of docs/explanation/idic.md works as printed: a new mode family is recovered."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.pair import ImagePair
 
-PAGE = Path(__file__).parents[1] / "docs" / "idic.md"
+PAGE = Path(__file__).parents[1] / "docs/explanation/idic.md"
 
 
 def test_the_printed_family_is_recovered() -> None:

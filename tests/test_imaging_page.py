@@ -1,4 +1,4 @@
-"""The example of docs/imaging.md works as printed, and its table of options is a valid case."""
+"""The example of docs/explanation/imaging.md works as printed, and its options are a valid case."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.runs.case import Case
 
-PAGE = (Path(__file__).parents[1] / "docs" / "imaging.md").read_text("utf-8")
+PAGE = (Path(__file__).parents[1] / "docs/explanation/imaging.md").read_text("utf-8")
 
 
 def test_the_printed_example_predicts_its_noise(tmp_path: Path) -> None:
     (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     names = {"folder": tmp_path}
-    exec(compile(block, "docs/imaging.md", "exec"), names)
+    exec(compile(block, "docs/explanation/imaging.md", "exec"), names)
     off = np.asarray(names["off"])
     assert abs(off.std() - 1.0) < 4 / np.sqrt(2 * off.size)
 

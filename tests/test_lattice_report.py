@@ -130,7 +130,7 @@ def test_long_waves_are_named_by_their_direction() -> None:
 def test_waves_that_come_earlier_are_not_kept_quiet() -> None:
     point = CriticalPoint("uniaxial", 0.1, True, "critical", (made_up.M,), (0,), (1,))
     text = proof(critical(point)["critical"])
-    assert text.endswith("no other wave of the grid is unstable before")
+    assert text.endswith("no other wave that was looked at is unstable before")
     point = replace(point, earlier=((1.0, 2.0), (1.5, 2.0)))
     text = proof(critical(point)["critical"])
     assert text.endswith("but 2 other waves are unstable before")

@@ -1,4 +1,4 @@
-"""The example of docs/photographs.md works as printed, on photographs with a known motion."""
+"""The example of docs/how-to/photographs.md works as printed, on images of known motion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.sensor import quantise
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
-PAGE = (Path(__file__).parents[1] / "docs" / "photographs.md").read_text("utf-8")
+PAGE = (Path(__file__).parents[1] / "docs/how-to/photographs.md").read_text("utf-8")
 
 
 def test_the_printed_example_finds_the_motion(
@@ -30,7 +30,7 @@ def test_the_printed_example_finds_the_motion(
     (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    exec(compile(block, "docs/photographs.md", "exec"), names)
+    exec(compile(block, "docs/how-to/photographs.md", "exec"), names)
 
     grid, mask, u = (names[k] for k in ("grid", "mask", "u"))
     x, y = np.meshgrid(grid.x, grid.y)  # type: ignore[attr-defined]

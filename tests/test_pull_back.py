@@ -18,7 +18,7 @@ def test_the_truth_brings_the_reference_back() -> None:
     result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth)
     back, seen = warped_back(g, result)
     assert seen[MASK].all()
-    # The spline's own error on this speckle, docs/idic.md.
+    # The spline's own error on this speckle, docs/explanation/idic.md.
     assert np.abs(back - f)[MASK].max() < 1e-4
 
 

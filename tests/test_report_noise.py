@@ -123,7 +123,7 @@ def test_a_fixed_mode_has_no_parameters_off_the_ideal() -> None:
 
 @dataclass(frozen=True)
 class Warm(Sensor):
-    """A sensor with a noise that this project doesn't have, as in docs/extending.md."""
+    """A sensor with a noise that this project doesn't have, as in docs/how-to/extending.md."""
 
     dark_variance: float = 0.0
 

@@ -91,7 +91,7 @@ def test_polynomials_over_a_rectangle(degree: int, waves: tuple[float, float]) -
 
 @pytest.mark.parametrize("degree", range(1, 9))
 def test_a_rule_for_the_finest_period_of_polynomials(degree: int) -> None:
-    """L / (0.17 + 0.327 p), told in docs/resolution.md: half a percent from Bessel's formula."""
+    """L / (0.17 + 0.327 p), docs/explanation/resolution.md: 0.5 % from Bessel's formula."""
     finest = finest_period(lambda period: polynomial_transfer(degree, 1.0 / period), 0.1, 20.0)
     assert finest == pytest.approx(1.0 / (0.17 + 0.327 * degree), rel=5e-3)
 

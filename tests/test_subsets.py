@@ -89,7 +89,7 @@ def test_without_pyvale_the_way_to_it_is_reported(monkeypatch: pytest.MonkeyPatc
         pyvale_python()
     monkeypatch.delenv(WHERE)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(MissingDependencyError, match=r"docs/fields\.md"):
+    with pytest.raises(MissingDependencyError, match=r"docs/how-to/fields\.md"):
         pyvale_python()
 
 

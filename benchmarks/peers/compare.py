@@ -4,7 +4,7 @@ Run: benchmarks/peers/run [--quick] [--again] [ROW ...]
 
 Every row is measured in a process of its own and kept at once, so that an interrupted run goes
 on where it stopped; a change of the code, of the peers or of the machine begins a new one. Full
-runs write the tables of docs/benchmarks.md, quick ones show them only.
+runs write the tables of docs/explanation/benchmarks.md, quick ones show them only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from record import Record, stamp
 
 HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
-PAGE = PROJECT / "docs" / "benchmarks.md"
+PAGE = PROJECT / "docs/explanation/benchmarks.md"
 SECTIONS: dict[str, ModuleType] = {
     "geometry": geometry, "intensity": intensity, "correlation": correlation,
 }  # fmt: skip

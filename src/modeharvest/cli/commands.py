@@ -147,7 +147,7 @@ def bloch(case: CaseName, out: OutFolder) -> None:
     """Analyse an infinite lattice: what makes it buckle first, of all waves (needs dolfinx).
 
     Square, hexagonal or chiral, or with kind = "file" a mesh or geometry of your own (see
-    docs/lattices.md). Leaves the first critical load and waves with their proof, eigenvalues
+    docs/how-to/lattices.md). Leaves the first critical load and waves with their proof, eigenvalues
     against the wave vector (dispersion.csv, dispersion.h5), report.html and summary.json.
     """
     _analyse(case, out, whole=False)
@@ -200,6 +200,14 @@ def harvest(
         ),
     ] = False,
     whole_field: WholeField = None,
+    watch: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Follow a running test: its photographs come here."),
+    ] = None,
+    until_still: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Stop watching when none has come for so long."),
+    ] = None,
 ) -> None:
     """Harvest modes from photographs of a test: v0, v1 and phi1 with error bars.
 
@@ -207,7 +215,14 @@ def harvest(
     all else is found or has a default. Begin with 'modeharvest harvest --example >
     experiment.toml'. Leaves results/, report.html and summary.json in DIR. Run the same command
     again after an interruption: finished photographs are not measured again.
+
+    With --watch, photographs are measured quickly as they come, and DIR/watch.html predicts when
+    the specimen will buckle; it ends with Ctrl-C, or --until-still. Without it, then, all are
+    measured in full.
     """
+    if watch is not None:
+        _watch(experiment, out, watch, until_still)
+        return
     from modeharvest.report.model import print_report
     from modeharvest.report.photographs import photographs_report
     from modeharvest.runs.photographs.pipeline import harvest as harvest_photographs
@@ -215,6 +230,17 @@ def harvest(
     with bars() as progress:
         summary = harvest_photographs(experiment, out, progress, whole_field)
     print_report(photographs_report(summary), out)
+
+
+def _watch(experiment: Path, out: Path, folder: Path, until_still: float | None) -> None:
+    from modeharvest.report.figures.sequence import watch_text
+    from modeharvest.runs.photographs.watch import watch
+
+    print(f"watching {folder}: open {out / 'watch.html'}", flush=True)
+    test = watch(experiment, out, folder, until_still=until_still,
+                 show=lambda line: print(line, flush=True))  # fmt: skip
+    print(watch_text(test))
+    print(f"measure them in full by: modeharvest harvest {experiment} --out {out}")
 
 
 def measure(
@@ -235,11 +261,15 @@ def measure(
     brightness: Annotated[
         int, typer.Option(help="Degree of polynomials by which gain and offset may vary: 0 to 6.")
     ] = 0,
+    every: Annotated[int, typer.Option(help="Only every so many of the images.")] = 1,
+    log: Annotated[
+        Path | None, typer.Option(help="What the testing machine wrote down, joined by time.")
+    ] = None,
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
-    TIFF, PNG or JPEG of one size; of a plain specimen, all of it in the images, contours are
-    measured. Leaves displacement, standard deviations, strains (HDF5, VTU, CSV, TIFF maps),
+    TIFF, PNG or JPEG of one size, folders, videos; of a plain specimen, all of it in the images,
+    contours. Leaves displacement, standard deviations, strains (HDF5, VTU, CSV, TIFF maps),
     report.html and summary.json in DIR. Run it again after an interruption: it continues.
 
     For example: modeharvest measure ref.tif def_*.tif --mask mask.png --out out/plate
@@ -247,11 +277,14 @@ def measure(
     from modeharvest.report.measure import measure_report
     from modeharvest.report.model import print_report
     from modeharvest.runs.measure import measure as measure_images
+    from modeharvest.runs.photographs.machine_log import LogTable
+    from modeharvest.runs.photographs.sequence import FrameChoice
 
     with bars() as progress:
         summary = measure_images(
             reference, deformed, out, mask=mask, pixel_size=pixel_size, mesh=mesh,
-            brightness=brightness, progress=progress,
+            brightness=brightness, choice=FrameChoice(every=every),
+            log=None if log is None else LogTable(str(log)), progress=progress,
         )  # fmt: skip
     print_report(measure_report(summary), out)
 

@@ -15,6 +15,10 @@ import typer
 from typer.core import TyperCommand
 
 from modeharvest.cli import benchmark, commands, design, homogenization, identification, messages
+from modeharvest.cli.demo import ABOUT, EXIT_CODES, FIRST, demo
+from modeharvest.cli.doctor import doctor
+from modeharvest.cli.fields import animate, export, gauges
+from modeharvest.cli.sharing import COMMANDS, share
 from modeharvest.util import __version__
 from modeharvest.util.machine import is_first
 
@@ -23,18 +27,9 @@ if TYPE_CHECKING:
 
 
 app = typer.Typer(
-    help=(
-        "A virtual laboratory for integrated digital image correlation (IDIC) on mechanical "
-        "metamaterials: buckle a cellular elastomer, make speckle images whose truth is known at "
-        "every pixel, measure them, and see its errors and where they come from.\n\n"
-        "Start with: [bold]modeharvest run paper-virtual --out out/demo[/bold], or, for the modes "
-        "of an infinite lattice, [bold]modeharvest modes square-lattice --out out/square[/bold]"
-    ),
-    epilog=(
-        "Exit codes: 0 done, 2 the input can't be used (one line says why), 70 a fault in the "
-        "program (one line names a log), 130 interrupted."
-    ),
-    no_args_is_help=True,
+    help=ABOUT,
+    epilog=EXIT_CODES,
+    invoke_without_command=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -50,8 +45,9 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
     "An infinite lattice": (commands.bloch, commands.modes),
     "Modes in use": (homogenization.homogenize,),
     "Photographs of a test": (commands.harvest, commands.measure, identification.identify),
+    "What was measured": (gauges, animate, export),
     "How good a measurement is": (design.design, commands.study, benchmark.score),
-    "To begin with": (commands.cases,),
+    "To begin with, and to share": (demo, doctor, commands.cases, share),
 }  # fmt: skip
 
 
@@ -82,7 +78,7 @@ def _help(command: Callable[..., None]) -> str:
 for family, members in _FAMILIES.items():
     for command in members:
         app.command(cls=_Command, help=_help(command), rich_help_panel=family)(command)
-for command in (benchmark.make, benchmark.star, benchmark.resolution):
+for command in (benchmark.make, benchmark.star, benchmark.resolution, *COMMANDS):
     benchmark_app.command(cls=_Command, help=_help(command))(command)
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
 
@@ -95,11 +91,13 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _common(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
     ] = False,
 ) -> None:
-    pass
+    if context.invoked_subcommand is None:
+        print(FIRST.format(version=__version__))
 
 
 def main() -> None:

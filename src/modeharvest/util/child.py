@@ -37,6 +37,8 @@ def _flattened(content: dict[str, Any], above: str = "") -> Iterable[tuple[str, 
             continue
         if isinstance(value, dict):
             yield from _flattened(value, f"{above}{name}/")
+        elif isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
+            yield from _flattened({str(k): one for k, one in enumerate(value)}, f"{above}{name}/")
         else:
             yield above + name, np.asarray(value)
 

@@ -169,6 +169,34 @@ class Stages:
         write_json(self.folder / RECORD, dict(sorted(record.items())))
 
 
+class Kept(Mapping[str, R]):
+    """What stages have left, by their names: read when it is asked for, and not kept but the last.
+
+    So thousands of images need no more memory than two.
+    """
+
+    def __init__(self) -> None:
+        self._read: dict[str, Callable[[], R]] = {}
+        self._last: tuple[str, R] | None = None
+
+    def add(self, name: str, read: Callable[[], R]) -> None:
+        """Take in one more, the last in their order, and how it is read."""
+        self._read[name] = read
+
+    def __getitem__(self, name: str) -> R:
+        if self._last is None or self._last[0] != name:
+            read = self._read[name]
+            self._last = None
+            self._last = name, read()
+        return self._last[1]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._read)
+
+    def __len__(self) -> int:
+        return len(self._read)
+
+
 @dataclass(frozen=True)
 class StagedRun(Stages, Generic[C]):
     """What every kind of run has: a case, a folder, stages that are not done twice."""
@@ -185,7 +213,7 @@ class StagedRun(Stages, Generic[C]):
         records: Path,
         work: Callable[[str, tuple[str, R] | None], tuple[Sequence[Path], dict[str, Any]]],
         read: Callable[[str, dict[str, Any]], R],
-    ) -> tuple[dict[str, R], dict[str, str]]:
+    ) -> tuple[Kept[R], dict[str, str]]:
         """A stage for each of several images, from the last one in which something was found.
 
         ``keys``: by their names; ``work`` gets a name, and that of the last one with what was found
@@ -193,12 +221,13 @@ class StagedRun(Stages, Generic[C]):
         ``records``; ``read`` reads them again. Returns what was found and why others failed: an
         InputError of the work is taken down as ``failed``, unless its files couldn't be written.
         """
-        found: dict[str, R] = {}
+        found: Kept[R] = Kept()
         failed: dict[str, str] = {}
 
         def one(name: str, path: Path) -> Sequence[Path]:
             try:
-                files, about = work(name, next(reversed(found.items()), None))
+                last = next(reversed(tuple(found)), None)
+                files, about = work(name, None if last is None else (last, found[last]))
             except WriteError:
                 raise
             except InputError as error:
@@ -213,7 +242,7 @@ class StagedRun(Stages, Generic[C]):
             if about["failed"]:
                 failed[name] = about["failed"]
             else:
-                found[name] = read(name, about)
+                found.add(name, partial(read, name, about))
         return found, failed
 
 

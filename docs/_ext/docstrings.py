@@ -1,0 +1,78 @@
+"""The project's docstrings made reStructuredText: lists of arguments, bars, and underscores."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from sphinx.application import Sphinx
+
+ARGUMENT = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*) : (\S.*)$")
+LITERAL = re.compile(r"(``.*?``|:\w+:`[^`]*`)")
+
+
+def escaped(line: str) -> str:
+    """Bars of absolute values and underscores at a word's end stand for themselves."""
+    parts = LITERAL.split(line)
+    for k in range(0, len(parts), 2):
+        parts[k] = re.sub(r"\|", r"\\|", parts[k])
+        parts[k] = re.sub(r"(?<=\w)_(?!\w)", r"\\_", parts[k])
+    return "".join(parts)
+
+
+def with_fields(paragraph: list[str]) -> list[str]:
+    """A list of arguments, ``name : what it is`` and indented lines, as fields."""
+    if not paragraph or not ARGUMENT.match(paragraph[0]):
+        return paragraph
+    if not all(ARGUMENT.match(line) or line.startswith("    ") for line in paragraph):
+        return paragraph
+    found: list[str] = []
+    texts: list[tuple[list[str], list[str]]] = []
+    for line in paragraph:
+        if match := ARGUMENT.match(line):
+            texts.append(([name.lstrip("*") for name in match[1].split(", ")], [match[2]]))
+        else:
+            texts[-1][1].append(line.strip())
+    for names, text in texts:
+        found += [f":param {name}: {' '.join(text)}" for name in names]
+    return found
+
+
+def paragraphs(lines: Iterable[str]) -> list[list[str]]:
+    """Lines between blank ones."""
+    found: list[list[str]] = [[]]
+    for line in lines:
+        if line.strip():
+            found[-1].append(line)
+        else:
+            found.append([])
+    return found
+
+
+def process(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: list[str]) -> None:
+    """Rewrite a docstring's lines in place."""
+    numpy_style = any(re.fullmatch(r"\s*-{4,}", line) for line in lines)
+    out: list[str] = []
+    verbatim = False
+    for paragraph in paragraphs(lines):
+        if paragraph and not paragraph[0].startswith(" "):
+            verbatim = False
+        if verbatim:
+            out += [*paragraph, ""]
+            continue
+        text = paragraph if numpy_style else with_fields(paragraph)
+        out += [*map(escaped, text), ""]
+        verbatim = (bool(paragraph) and paragraph[-1].rstrip().endswith("::")) or (
+            verbatim and not paragraph
+        )
+        if not paragraph and len(out) > 1 and out[-2:] == ["", ""]:
+            out.pop()
+    # napoleon takes what stands before a colon in the first line for the type of an attribute.
+    lines[:] = ["", *out] if what in ("attribute", "data", "property") else out
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Before napoleon, whose priority is 500."""
+    app.connect("autodoc-process-docstring", process, priority=400)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,138 @@
+"""The documentation builds without a warning and without a network, and loads nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NO_NETWORK = dict.fromkeys(
+    ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"), "http://[::1]:9"
+)
+LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
+
+
+class Links(HTMLParser):
+    """What a page loads, what it links to, and the places that it has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.loads: set[str] = set()
+        self.links: set[str] = set()
+        self.places: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attrs}
+        self.places.add(given.get("id", ""))
+        if tag in LOADED and given.get("rel") not in ("next", "prev", "canonical"):
+            self.loads.add(given.get(LOADED[tag], ""))
+        if tag == "a":
+            self.links.add(given.get("href", ""))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as ``make docs`` does."""
+    out = tmp_path_factory.mktemp("site") / "html"
+    command = [sys.executable, "-m", "sphinx", "-b", "html", "-q", "-W", "--keep-going"]
+    done = subprocess.run(
+        [*command, "-j", "2", ROOT / "docs", out],
+        capture_output=True, text=True, check=False, env=os.environ | NO_NETWORK,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-5000:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> dict[Path, Links]:
+    """Every page of it, read."""
+    found = {}
+    for path in site.rglob("*.html"):
+        found[path] = Links()
+        found[path].feed(path.read_text("utf-8"))
+    return found
+
+
+@pytest.mark.dolfinx
+def test_no_page_loads_anything_from_elsewhere(site: Path, pages: dict[Path, Links]) -> None:
+    foreign = {
+        (path.name, name)
+        for path, page in pages.items()
+        for name in page.loads
+        if re.match(r"(\w+:)?//", name)
+    }
+    assert foreign == set()
+    for style in site.rglob("*.css"):
+        assert not re.search(r"(url\(|@import)\s*[\"']?(\w+:)?//", style.read_text("utf-8")), style
+
+
+@pytest.mark.dolfinx
+def test_every_link_leads_somewhere(pages: dict[Path, Links]) -> None:
+    lost = set()
+    for path, page in pages.items():
+        for link in page.links | page.loads:
+            target, _, place = unquote(link).partition("#")
+            if re.match(r"\w+:|//", target) or not (target or place):
+                continue
+            there = (path.parent / target.partition("?")[0]).resolve() if target else path
+            there = there / "index.html" if there.is_dir() else there
+            if not there.exists() or (
+                place and there in pages and place not in pages[there].places
+            ):
+                lost.add((path.name, link))
+    assert lost == set()
+
+
+@pytest.mark.dolfinx
+def test_the_gallery_has_a_dozen_pictures_most_without_dolfinx(site: Path) -> None:
+    programs = sorted((ROOT / "examples/gallery").glob("plot_*.py"))
+    assert len(programs) >= 12
+    needing = [
+        p.name for p in programs if re.search(r"fem\.(bloch|lattice|simulate)", p.read_text())
+    ]
+    assert len(needing) <= 3
+    for program in programs:
+        page = (site / "generated/gallery" / f"{program.stem}.html").read_text("utf-8")
+        assert f"sphx_glr_{program.stem}_001.png" in page
+
+
+@pytest.mark.dolfinx
+def test_equations_are_markup(site: Path) -> None:
+    assert "<math" in (site / "tutorials/virtual_experiment.html").read_text("utf-8")
+
+
+@pytest.mark.dolfinx
+@pytest.mark.parametrize(
+    ("page", "texts"),
+    [
+        ("keys/virtual_experiment", ["fill_factor", "0 to 1", "1 to 16", "0 &lt; … &lt; 1.9"]),
+        ("keys/photographs", ["formulation", "v0_degree", "mm/px"]),
+        ("command_line", ["modeharvest benchmark make", "--whole-field", "TOML file"]),
+        ("api/modeharvest.idic", ["correlate", "Kinematics", "ImagePair"]),
+    ],
+)
+def test_references_are_drawn_from_the_code(site: Path, page: str, texts: list[str]) -> None:
+    text = (site / f"generated/{page}.html").read_text("utf-8")
+    assert [t for t in texts if t.lower() not in text.lower()] == []
+
+
+@pytest.mark.dolfinx
+def test_it_can_be_searched(site: Path) -> None:
+    text = (site / "searchindex.js").read_text("utf-8")
+    index = json.loads(text[text.index("{") : text.rindex("}") + 1])
+    assert "tutorials/virtual_experiment" in index["docnames"]
+
+
+@pytest.mark.dolfinx
+def test_no_equation_has_a_command_that_nothing_has_drawn(site: Path) -> None:
+    for path in site.rglob("*.html"):
+        for equation in re.findall(r"<math.*?</math>", path.read_text("utf-8"), re.DOTALL):
+            assert not re.search(r">\\\w", equation), (path.name, equation)
