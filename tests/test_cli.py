@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+from rich.text import Text
 
 from modeharvest import __version__
-from modeharvest.cli.root import main
+from modeharvest.cli.root import app, main
 from modeharvest.runs.case import Case
 
 COMMANDS = (
@@ -70,6 +75,18 @@ def test_every_command_has_help(
     lines = [line.strip() for line in shown.partition("╭")[0].splitlines()]
     for line, after in pairwise(lines):  # no line ends where the next word had its place, too
         assert not (line and after) or len(line) + 1 + len(after.split()[0]) > 78
+
+
+def test_nothing_in_help_is_taken_for_markup() -> None:
+    def texts(command: Any) -> Iterator[str]:
+        yield from (text or "" for text in (command.help, command.short_help, command.epilog))
+        yield from (getattr(option, "help", None) or "" for option in command.params)
+        for part in getattr(command, "commands", {}).values():
+            yield from texts(part)
+
+    for text in texts(typer.main.get_command(app)):
+        plain = re.sub(r"\[/?bold\]", "", text)
+        assert Text.from_markup(text).plain == plain
 
 
 def test_help_does_not_wait_for_what_only_the_work_needs() -> None:

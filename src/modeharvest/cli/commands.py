@@ -253,7 +253,7 @@ def measure(
         Path | None, typer.Option(help="Image, black off the material; by default it is found.")
     ] = None,
     pixel_size: Annotated[
-        float | None, typer.Option(help="Edge of a pixel [mm]; without, lengths are in px.")
+        float | None, typer.Option(help="Edge of a pixel in mm; without, lengths are in px.")
     ] = None,
     mesh: Annotated[
         Path | None, typer.Option(help="Triangles, from the middle of the image, x right, y up.")

@@ -11,7 +11,7 @@ def design(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> Non
     From the Cramér–Rao bound, without an image: standard deviations by the camera's noise; which
     pixel size, speckle, noise, exposures and light a wanted error needs; how degrees and strains
     change it. Leaves report.html with tables and a map, and summary.json. CASE is that
-    of a virtual experiment; a table [design] says what is wanted (docs/how-to/design.md).
+    of a virtual experiment; its table design says what is wanted (docs/how-to/design.md).
     """
     from modeharvest.report.design import design_report
     from modeharvest.report.model import print_report
