@@ -55,7 +55,7 @@ def export(
 
 def gauges(
     run: Run,
-    file: Annotated[Path, typer.Argument(metavar="GAUGES.toml", help="TOML file, a table for each gauge.")],
+    file: Annotated[Path, typer.Argument(metavar="GAUGES.toml", help="A table for each gauge.")],
 ) -> None:
     """Read gauges in every image of a run: DIR/gauges.csv, gauges_along.csv, gauges.pdf."""
     from modeharvest.idic.photograph.finished import FinishedRun
