@@ -1,7 +1,7 @@
 """Micromorphic homogenization against Bloch waves, direct simulations and an independent code.
 
 ``scripts/env python benchmarks/homogenization.py [SECTION ...]`` prints tables of
-docs/explanation/homogenization_studies.md, as Markdown:
+docs/explanation/homogenization_*.md, as Markdown:
 
 - ``cell``: homogeneous patterns: critical strain and stress on the branch, against Bloch waves and
   the branch of the periodic cell.

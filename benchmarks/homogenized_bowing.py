@@ -1,7 +1,7 @@
 """Where compressed specimens bow sideways, directly and homogenized, and why not at one strain.
 
 ``scripts/env python benchmarks/homogenized_bowing.py [SECTION ...]`` prints tables of
-docs/explanation/homogenization_studies.md, as Markdown:
+docs/explanation/homogenization_*.md, as Markdown:
 
 - ``waves``: transverse waves along x of the infinite lattice, exact (Bloch) and of the homogenized
   continuum: what gradients of shear cost, which only the lattice knows.

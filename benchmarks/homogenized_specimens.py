@@ -1,7 +1,7 @@
 """Homogenized specimens with bulk edges beside their direct simulations, and what they cost.
 
 ``scripts/env python benchmarks/homogenized_specimens.py [SECTION ...]`` prints tables of
-docs/explanation/homogenization_studies.md, as Markdown:
+docs/explanation/homogenization_*.md, as Markdown:
 
 - ``specimen``: the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
 - ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.

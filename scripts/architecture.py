@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Draw the module tables of docs/architecture.md from the first lines of the code's docstrings.
+"""Draw the figure and the module tables of docs/architecture.md from the code.
 
     scripts/architecture.py [--check]
 
-Everything below the mark is replaced; with --check nothing is written, and the exit code is 1 where
-the page isn't what the code says.
+The tables are the first lines of docstrings: everything below the mark is replaced. The figure has
+the layers, their packages and how many modules these have. With --check nothing is written, and the
+exit code is 1 where page or figure aren't what the code says.
 """
 
 from __future__ import annotations
@@ -19,6 +20,11 @@ PAGE = PROJECT / "docs/architecture.md"
 MARK = "<!-- From here on drawn from the code by scripts/architecture.py -->\n"
 APPLICATION = PROJECT / "src/modeharvest"
 FOLDERS = ("fem", "imaging", "idic", "validation")
+FIGURE = PROJECT / "docs/images/architecture.svg"
+LAYERS = (("util",), *((name,) for name in FOLDERS), ("runs", "report"), ("cli",))
+"""Each may import what stands to its left."""
+WIDTH, GAP, LINE, TOP = 122, 18, 17, 34
+"""Of a layer, between layers, of a line of text, of a heading [px]."""
 
 
 def packages() -> Iterator[Path]:
@@ -49,14 +55,65 @@ def tables() -> str:
     return "".join(parts)
 
 
+def counted(name: str) -> list[tuple[str, int]]:
+    """Packages within a layer's own, with how many modules each has; the layer itself first."""
+    root = (PROJECT if name in FOLDERS else APPLICATION) / name
+    inner = sorted(path.parent for path in root.rglob("__init__.py"))
+    return [
+        (path.relative_to(root).as_posix(), sum(m.stem != "__init__" for m in path.glob("*.py")))
+        for path in inner
+    ]
+
+
+def box(name: str, x: int, y: int) -> tuple[list[str], int]:
+    """A layer's box at a place as SVG, and where it ends."""
+    rows = counted(name)
+    height = TOP + LINE * (len(rows) - 1) + 10
+    total = sum(count for _, count in rows)
+    parts = [
+        f'<rect x="{x}" y="{y}" width="{WIDTH}" height="{height}" rx="6"/>',
+        f'<text class="head" x="{x + 10}" y="{y + 21}">{name}</text>',
+        f'<text class="count" x="{x + WIDTH - 10}" y="{y + 21}">{total}</text>',
+    ]
+    for k, (inner, count) in enumerate(rows[1:]):
+        at = y + TOP + LINE * k + 12
+        parts.append(f'<text x="{x + 10}" y="{at}">{inner.removeprefix("lattice/")}</text>')
+        parts.append(f'<text class="count" x="{x + WIDTH - 10}" y="{at}">{count}</text>')
+    return parts, y + height
+
+
+def figure() -> str:
+    """The layers from left to right, as SVG that is legible on light and on dark pages."""
+    parts, lowest = [], 0
+    for k, names in enumerate(LAYERS):
+        x, y = k * (WIDTH + GAP) + 1, 1
+        for name in names:
+            drawn, y = box(name, x, y)
+            parts += drawn
+            lowest, y = max(lowest, y), y + 8
+        if k:
+            parts.append(f'<path d="M{x - GAP + 2} 18h{GAP - 7}m-5 -5l5 5l-5 5"/>')
+    width = len(LAYERS) * (WIDTH + GAP) - GAP + 2
+    style = (
+        "text{font:12px system-ui,sans-serif;fill:#222}.head{font-weight:600;font-size:14px}"
+        ".count{text-anchor:end;fill:#666}rect{fill:#f4f6f8;stroke:#8a96a3}"
+        "path{fill:none;stroke:#8a96a3;stroke-width:1.6}"
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {lowest + 1}" '
+        f'width="{width}" height="{lowest + 1}"><style>{style}</style>\n'
+        + "\n".join(parts) + "\n</svg>\n"
+    )  # fmt: skip
+
+
 def main() -> int:
-    """Write the page, or compare it with the code."""
-    page = PAGE.read_text(encoding="utf-8")
-    prose = page.partition(MARK)[0]
-    drawn = prose + MARK + tables()
+    """Write page and figure, or compare them with the code."""
+    prose = PAGE.read_text(encoding="utf-8").partition(MARK)[0]
+    drawn = {PAGE: prose + MARK + tables(), FIGURE: figure()}
     if "--check" in sys.argv[1:]:
-        return int(drawn != page)
-    PAGE.write_text(drawn, encoding="utf-8")
+        return int(any(not p.exists() or p.read_text("utf-8") != t for p, t in drawn.items()))
+    for path, text in drawn.items():
+        path.write_text(text, encoding="utf-8")
     return 0
 
 

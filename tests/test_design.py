@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from documented_keys import undocumented
+from summary_schemas import faults
 
 from modeharvest.cli.root import main
 from modeharvest.fem.field import Mesh
@@ -253,7 +253,7 @@ def test_the_paper_s_case_is_designed_as_it_is_shipped(
     assert "Noise is not what limits this test" in printed
     assert "read noise of 1 % of full scale is assumed" in printed
     summary = read_json(tmp_path / "summary.json")
-    assert undocumented(summary, "design.md") == set()
+    assert faults(summary, "design") == []
     expected, varied = summary["expected"], summary["varied"]
     assert expected["w_px"] > 100 * expected["u_px"]
     # Beyond the critical strain the pattern grows, and its numbers are known the better.
@@ -347,5 +347,5 @@ def test_a_design_for_a_material(tmp_path: Path) -> None:
     assert 0.0 < summary["expected"]["parameter_sd"][0] < 0.05
     coarse = summary["varied"]["pixel_size"][-1]
     assert (np.array(coarse["parameter_sd"]) > summary["expected"]["parameter_sd"]).all()
-    assert undocumented(summary, "design.md") == set()
+    assert faults(summary, "design") == []
     assert summary["map"]["errors"][0][0] > 0.0

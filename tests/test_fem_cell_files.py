@@ -282,7 +282,9 @@ def test_what_is_asked_for_must_make_sense(tmp_path: Path) -> None:
 def test_the_recipes_work_as_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    text = (Path(__file__).parents[1] / "docs/how-to/lattices.md").read_text("utf-8")
+    pages = ("lattices.md", "own_cell.md")
+    folder = Path(__file__).parents[1] / "docs/how-to"
+    text = "".join((folder / page).read_text("utf-8") for page in pages)
     monkeypatch.chdir(tmp_path)
     space: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):

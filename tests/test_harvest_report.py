@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_harvest as made_up
-from documented_keys import undocumented
 from explored import content_of, quantity, samples
 from html_page import Page
 from matplotlib.path import Path
+from summary_schemas import faults
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.modes import FourierMode, Taper, free_family
@@ -83,8 +83,8 @@ def bare(harvest: Harvest) -> Harvest:
                    text=(), truth=None, versions={})  # fmt: skip
 
 
-def test_the_user_s_guide_has_every_key_of_the_summary(summary: dict[str, Any]) -> None:
-    assert undocumented(summary, "harvest.md") == set()
+def test_the_summary_is_as_its_schema_says(summary: dict[str, Any]) -> None:
+    assert faults(summary, "harvest") == []
 
 
 def test_nothing_is_loaded_from_elsewhere(text: str) -> None:

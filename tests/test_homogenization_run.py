@@ -12,9 +12,9 @@ import h5py
 import meshio
 import numpy as np
 import pytest
-from documented_keys import undocumented
 from numpy.typing import NDArray
 from scipy.io import loadmat
+from summary_schemas import faults
 
 from modeharvest.cli.root import main
 from modeharvest.fem.lattice.micromorphic.patterns import rotation_pattern
@@ -168,7 +168,7 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     assert "phi1 is not observable" in summary["warnings"][0], "four holes are few"
     assert {s["negative_eigenvalues"] for s in summary["states"]} == {0}
     require_exported(out, summary)
-    assert undocumented(summary, "homogenization.md") == set()
+    assert faults(summary, "homogenize") == []
     # The same mode from its file: without the images it was measured in, and their strain.
     result = out / "experiment/correlation/result_1300.json"
     one = SMALL.replace('"measured"', f'"file"\npath = "{result}"')

@@ -11,10 +11,10 @@ import meshio
 import numpy as np
 import pytest
 import tifffile
-from documented_keys import undocumented
 from explored import content_of, quantity, samples
 from manufactured import inverted, speckle
 from plate_with_hole import GRID, plate_pair, quadratic_field
+from summary_schemas import faults
 from test_cli import called, error_line
 
 from modeharvest.idic.finite_element.files import Given, read_result, write_csv, write_result
@@ -100,7 +100,7 @@ def test_both_images_up_to_the_edges(plate: Plate, measured: Path) -> None:
 
 def test_summary(plate: Plate, measured: Path) -> None:
     summary = json.loads((measured / "summary.json").read_text())
-    assert undocumented(summary, "measure.md") == set()
+    assert faults(summary, "measure") == []
     first, second = summary["images"]
     truth = plate.truth["b"][plate.mask] / GRID.pixel_size
     assert second["rms_px"] == pytest.approx(np.sqrt(np.mean(truth**2)), rel=0.01)

@@ -203,7 +203,7 @@ def test_the_example_in_metres_runs_and_its_nodes_are_the_file_s(
 
 
 def test_the_docs_show_the_example_s_case_and_help_names_the_kind() -> None:
-    page = (ROOT / "docs/how-to/lattices.md").read_text("utf-8")
+    page = (ROOT / "docs/how-to/own_cell.md").read_text("utf-8")
     case = load(ROOT / "examples" / "own_cell.py").CASE
     assert case.strip() in page
     reported = subprocess.run(

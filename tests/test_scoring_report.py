@@ -19,6 +19,7 @@ import synthetic_benchmark as made
 from explored import content_of, quantity
 from html_page import Page
 from numpy.typing import NDArray
+from summary_schemas import faults
 from synthetic_benchmark import PIXEL, STRAIN
 
 from modeharvest.cli.root import main
@@ -103,6 +104,7 @@ def test_files_and_page_tell_the_same(command: tuple[Path, str, int]) -> None:
     folder, message, code = command
     assert code == 0
     summary = json.loads((folder / "out" / "scores.json").read_text("utf-8"))
+    assert faults(summary, "score") == []
     assert [field["name"] for field in summary["fields"]] == ["good", "fair", "sparse"]
     assert summary["fields"][1]["everywhere"]["returned"] == pytest.approx(0.9, abs=1e-3)
     page = (folder / "out" / "report.html").read_text("utf-8")

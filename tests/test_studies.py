@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from html_page import Page, frame
 from scipy import stats
+from summary_schemas import faults
 from test_cli import called, error_line
 
 from modeharvest.fem.field import Solution
@@ -393,6 +394,7 @@ def test_a_study_from_the_command_line(
     assert "2 of 2 initial guesses" in (printed := capsys.readouterr().out)
     assert "report.html" in printed
     summary = read_json(out / "summary.json")
+    assert faults(summary, "study") == []
     assert summary["numbers"]["initial_guesses"] == 2
     assert summary["failed"] == []
     assert len(pd.read_csv(out / "table.csv")) == 3

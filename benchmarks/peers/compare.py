@@ -4,7 +4,7 @@ Run: benchmarks/peers/run [--quick] [--again] [ROW ...]
 
 Every row is measured in a process of its own and kept at once, so that an interrupted run goes
 on where it stopped; a change of the code, of the peers or of the machine begins a new one. Full
-runs write the tables of docs/explanation/benchmarks.md, quick ones show them only.
+runs write the tables of docs/explanation/benchmarks*.md, quick ones show them only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ from record import Record, stamp
 
 HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
-PAGE = PROJECT / "docs/explanation/benchmarks.md"
+PAGES = {
+    PROJECT / "docs/explanation/benchmarks.md": ("run", "geometry", "intensity"),
+    PROJECT / "docs/explanation/benchmarks_correlation.md": ("correlation",),
+}
+"""And the tables that each has."""
 SECTIONS: dict[str, ModuleType] = {
     "geometry": geometry, "intensity": intensity, "correlation": correlation,
 }  # fmt: skip
@@ -109,8 +113,9 @@ def _report(record: Record, names: list[str], *, write: bool) -> None:
     if missing:
         print(f"\nnot measured yet: {', '.join(missing)}")
     elif write:
-        document.write(PAGE, tables)
-        print(f"\nwritten: {PAGE.relative_to(PROJECT)}")
+        for page, own in PAGES.items():
+            document.write(page, {name: tables[name] for name in own})
+            print(f"\nwritten: {page.relative_to(PROJECT)}")
 
 
 if __name__ == "__main__":

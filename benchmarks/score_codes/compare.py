@@ -8,7 +8,8 @@ returns a file, as anybody's would be, and 'modeharvest score' grades the files.
 out/score_codes, with the report. The specimens: the paper's, with 60 holes, and a plate with one.
 
 --standard: instead, the cases of a set that 'modeharvest benchmark standard --out DIR' made, and
-their leaderboard; fields that are there already are kept, so it can be interrupted.
+their leaderboard; fields that are there already are kept, so it can be interrupted. With all codes
+and cases its table is written to docs/how-to/scoring.md.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -50,6 +52,10 @@ from modeharvest.util.errors import InputError, MissingDependencyError
 from modeharvest.util.files import read_json
 
 HERE = Path(__file__).resolve().parent
+PAGE = HERE.parents[1] / "docs/how-to/scoring.md"
+sys.path.append(str(HERE.parent / "peers"))
+import document  # noqa: E402
+
 OUT = HERE.parents[1] / "out" / "score_codes"
 SUBSET_PX, STEP_PX = 21, 5
 TIMEOUT_S = 600.0
@@ -214,6 +220,28 @@ def standard(public: Path, arguments: argparse.Namespace) -> None:
     for row in board["codes"]:
         rms = {case: round(numbers["rms_px"], 4) for case, numbers in row["cases"].items()}
         print(f"{row['code']}: {row['rms_px']:.3g} px over {row['counted']} cases: {rms}")
+    if not (arguments.cases or arguments.only):
+        document.write(PAGE, {"standard": standard_table(board, cases)})
+
+
+def standard_table(board: dict[str, Any], cases: dict[str, Any]) -> list[str]:
+    """Rms errors [px] as Markdown, with the share of the material that is covered if not all is."""
+    rows = board["codes"]
+    lines = [f"| rms [px], set {board['set']} | " + " | ".join(r["code"] for r in rows) + " |"]
+    lines.append("|---" * (len(rows) + 1) + "|")
+    for case in cases:
+        cells = []
+        for row in rows:
+            found, missing = row["cases"].get(case), "failed"
+            if CODES[row["code"]] in (idic, whole) and case in OTHER_SPECIMENS:
+                missing = "–"
+            share = 100 * found["covered"] if found else 100.0
+            part = f" ({share:.0f} %)" if share < 99.5 else ""
+            cells.append(f"{found['rms_px']:.2g}{part}" if found else missing)
+        lines.append(f"| {case} | " + " | ".join(cells) + " |")
+    lines.append("| cases that count | " + " | ".join(str(r["counted"]) for r in rows) + " |")
+    means = " | ".join(f"{r['rms_px']:.2g}" for r in rows)
+    return [*lines, f"| geometric mean over them | {means} |"]
 
 
 def main() -> None:

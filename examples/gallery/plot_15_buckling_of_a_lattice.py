@@ -3,7 +3,7 @@ What makes an infinite lattice buckle first
 ===========================================
 
 Of all Bloch waves, the first that costs no energy: its critical strain, and its mode. This example
-needs dolfinx, all others don't.
+needs dolfinx.
 """
 
 import matplotlib.pyplot as plt

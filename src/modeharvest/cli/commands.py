@@ -147,7 +147,7 @@ def bloch(case: CaseName, out: OutFolder) -> None:
     """Analyse an infinite lattice: what makes it buckle first, of all waves (needs dolfinx).
 
     Square, hexagonal or chiral, or with kind = "file" a mesh or geometry of your own (see
-    docs/how-to/lattices.md). Leaves the first critical load and waves with their proof, eigenvalues
+    docs/how-to/own_cell.md). Leaves the first critical load and waves with their proof, eigenvalues
     against the wave vector (dispersion.csv, dispersion.h5), report.html and summary.json.
     """
     _analyse(case, out, whole=False)
