@@ -56,6 +56,6 @@ def test_every_key_says_what_it_is(command: str) -> None:
             assert about["description"] or name in ("unit", "source", "observable"), (command, name)
 
 
-def test_a_summary_of_each_command_is_held_against_its_schema() -> None:
+def test_a_summary_of_each_command_is_checked() -> None:
     tests = "".join(path.read_text("utf-8") for path in (ROOT / "tests").glob("test_*.py"))
     assert set(re.findall(r'faults\(\w+(?:\[1\])?, "(\w+)"\)', tests)) == set(COMMANDS)
