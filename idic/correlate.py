@@ -323,18 +323,13 @@ def make_result(
     constants = [ansatz.v0_slice(c).start for c in (0, 1)]
     per_px = grid.pixel_size**2 / max(1, found.equations.pixels)
     return Result(
-        ansatz=ansatz,
-        grid=grid,
-        unknowns=found.unknowns.copy(),
-        inverse=inverse,
+        ansatz=ansatz, grid=grid, unknowns=found.unknowns.copy(), inverse=inverse,
         slope_square=float(np.mean(np.diag(matrix)[constants])) * per_px,
         weight_square=float(np.mean(np.diag(weight)[constants])) * per_px,
-        residual_rms=float(np.sqrt(found.equations.mean_square)),
-        pixels=found.equations.pixels,
-        outside_image=found.equations.outside_image,
-        outcome=found.outcome,
+        residual_rms=float(np.sqrt(found.equations.mean_square)), pixels=found.equations.pixels,
+        outside_image=found.equations.outside_image, outcome=found.outcome,
         condition_number=eigen.condition_number,
-    )
+    )  # fmt: skip
 
 
 def _assessed(
@@ -371,17 +366,13 @@ def _result(
         found = replace(found, outcome=Outcome.LOCAL_MINIMUM)
     order = pair.deformed.order
     where = (ansatz, found.unknowns, pair.grid, used.mask, order)
+    expected = spline_autocorrelation(*where, lags_px)
     return replace(
-        make_result(ansatz, pair.grid, found, how),
-        noise_transfer=NoiseTransfer.of(*where),
-        order=order,
-        residual_correlation=autocorrelation(
-            left, lags_px, spline_autocorrelation(*where, lags_px)
-        ),
-        residual_lags_px=lags_px,
-        decorrelated_fraction=lost,
+        make_result(ansatz, pair.grid, found, how), noise_transfer=NoiseTransfer.of(*where),
+        order=order, residual_correlation=autocorrelation(left, lags_px, expected),
+        residual_lags_px=lags_px, decorrelated_fraction=lost,
         weighting=weighting or Weighting(speckle_size_px=size_px),
-    )
+    )  # fmt: skip
 
 
 def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> Weighting:

@@ -259,3 +259,14 @@ def test_other_bit_depths_are_refused_but_a_darker_frame_is_not(tmp_path: Path) 
     for name in ("8.tif", "8in16.tif"):
         with pytest.raises(InputError, match=r"one bit depth, got 12 bits in 16.*8 bits"):
             require_alike(reference, read_photograph(tmp_path / name))
+
+
+@pytest.mark.parametrize("size", [1.5, 2.5, 4.0])
+def test_compression_that_shows_is_noted(tmp_path: Path, size: float) -> None:
+    levels = counts(8, shape=(300, 400), size=size)
+    for quality, corner in ((95, 0), (30, 0), (30, 3)):
+        Image.fromarray(levels).save(tmp_path / "a.jpg", quality=quality)
+        stored = np.asarray(Image.open(tmp_path / "a.jpg"))[corner:, corner:]
+        Image.fromarray(stored).save(tmp_path / "a.png")  # saved again, and cropped
+        notes = read_photograph(tmp_path / "a.png").notes
+        assert any("blocks of 8 x 8 px" in note for note in notes) == (quality == 30)

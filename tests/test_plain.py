@@ -305,3 +305,21 @@ def test_pictures_that_are_not_plain_or_not_whole() -> None:
     fewer = disks((132, 132), 15.25, CENTRES[:1], np.array([15.0, 11.0]), 0.3)
     with pytest.raises(InputError, match="the reference's 4 holes in the deformed picture, found"):
         displacement_of_plain(surface, fewer, grid, body)
+
+
+def test_of_two_specimens_one_is_followed_and_the_other_one_named() -> None:
+    holes = np.array([15.0, 11.0]), 0.3
+    one = disks((132, 132), 15.25, CENTRES, *holes)
+    other = disks((132, 120), 15.25, CENTRES[[0, 2]], *holes)
+    reference = plain_surface(np.hstack([other, one]))
+    assert reference is not None
+    assert not reference.mask[:, :120].any()
+    (text,) = reference.text
+    assert text.startswith("There are 2 specimens in the picture; the one of ")
+    assert text.endswith("crop the pictures to measure another one.")
+    grown = disks((132, 120), 8.25, CENTRES[[0, 2]], np.array([3.0, 3.0]), 0.0)  # the larger now
+    both = np.hstack([grown, one])
+    assert plain_surface(both).mask[:, :120].any()
+    np.testing.assert_array_equal(plain_surface(both, like=reference.mask).mask, reference.mask)
+    cut = np.hstack([other[:, 30:], one])  # the other one is not all in view
+    np.testing.assert_array_equal(plain_surface(cut).mask[:, -132:], reference.mask[:, -132:])

@@ -8,6 +8,8 @@ from plate_with_hole import GRID, HALF_SIZE, RADIUS, is_material
 
 from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.idic.finite_element.mesh import boundaries, mesh_of_mask, meshable, quadratic
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.bernstein import non_positive_jacobians
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.util.errors import InputError
 
@@ -114,3 +116,12 @@ def test_other_and_folded_elements_are_refused() -> None:
     folded = Mesh([[0, 0], [0, 1], [1, 0], [1, 1]], [[0, 1, 2], [1, 2, 3]], "T3")
     with pytest.raises(InputError, match="positive Jacobians"):
         quadratic(folded)
+
+
+def test_a_notch_whose_curved_sides_fold_an_element_is_meshed() -> None:
+    row, col = np.indices((131, 131))
+    y, x = row - 65.5, col - 64.6
+    notched = (np.hypot(x, y) < 20.0) | ((np.abs(x) < 2.6) & (np.abs(y) < 25.0))
+    mask = (np.abs(row - 65) < 50) & (np.abs(col - 65) < 50) & ~notched
+    mesh = mesh_of_mask(mask, PixelGrid.centred(131, 131, 1.0), 24.0, 12.0).mesh
+    assert not non_positive_jacobians(mesh.nodes, mesh.cells, "T6").size

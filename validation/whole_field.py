@@ -91,16 +91,13 @@ def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> Who
     by_idic, by_refit = (fit.displacement()[there] for fit in (correlated, refit))
     w = u[there] - by_idic
     return WholeFieldNumbers(
-        w_rms_px=rms(w) / px,
-        w_max_px=float(lengths(w).max()) / px,
+        w_rms_px=rms(w) / px, w_max_px=float(lengths(w).max()) / px,
         rms_beyond_refit_px=rms(u[there] - by_refit) / px,
         rms_refit_to_idic_px=rms(by_refit - by_idic) / px,
-        sd_px=rms(measured.standard_deviation) / px,
-        coverage=float(there.sum() / mask.sum()),
+        sd_px=rms(measured.standard_deviation) / px, coverage=float(there.sum() / mask.sum()),
         modes=tuple(_both_ways(refit, correlated, i) for i in range(len(refit.ansatz.modes))),
-        **picked(measured, "cutoff_px unknowns residual_rms library warnings"),
-        start=whole.start,
-    )
+        **picked(measured, "cutoff_px unknowns residual_rms library warnings"), start=whole.start,
+    )  # fmt: skip
 
 
 def _both_ways(refit: Result, correlated: Result, i: int) -> ModeBothWays:
@@ -155,19 +152,16 @@ def compare_whole(
     places = {name: labels == REGIONS.index(name) for name in REGIONS}
     by_region = {name: rms(error[place]) / px for name, place in places.items() if place.any()}
     return WholeFieldSummary(
-        rms_px=rms(error[there]) / px,
-        rms_edges_px=by_region.get(EDGES),
-        rms_ligaments_px=by_region.get(LIGAMENTS),
-        rms_junctions_px=by_region.get(JUNCTIONS),
-        rms_bulk_px=by_region.get(BULK),
-        max_px=float(lengths(error[there]).max()) / px,
+        rms_px=rms(error[there]) / px, rms_edges_px=by_region.get(EDGES),
+        rms_ligaments_px=by_region.get(LIGAMENTS), rms_junctions_px=by_region.get(JUNCTIONS),
+        rms_bulk_px=by_region.get(BULK), max_px=float(lengths(error[there]).max()) / px,
         coverage=float(there.sum() / mask.sum()),
         rms_refit_to_best_fit_px=rms((refit.displacement() - best.displacement())[mask]) / px,
         interval_coverage=float(inside[there].mean()),
         interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in by_region else None,
         mode=_square_mode(refit, specimen.pitch),
         **picked(measured, "cutoff_px unknowns contradicted library warnings"),
-    )
+    )  # fmt: skip
 
 
 def _square_mode(refit: Result, pitch: float) -> tuple[float, ...]:

@@ -19,7 +19,7 @@ from skimage import measure
 
 from modeharvest.fem.field import Mesh, with_mid_sides
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.bernstein import require_positive_jacobian
+from modeharvest.imaging.mapping.bernstein import non_positive_jacobians, require_positive_jacobian
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.masks import large_parts, opened
@@ -138,8 +138,16 @@ def mesh_of_mask(
     x, y = grid.to_mm(-nodes[:, 1], nodes[:, 0])
     over = (_twice_area(nodes, cells) < 0.0)[:, None]
     cells = np.where(over, cells[:, _REVERSED["T6"]], cells)
-    mesh = quadratic(Mesh(np.stack([x, y], axis=1), cells, "T6"))
+    mesh = quadratic(Mesh(_unfolded(np.stack([x, y], axis=1), cells), cells, "T6"))
     return MeshedMaterial(mesh, kept, changes)
+
+
+def _unfolded(nodes: FloatArray, cells: IntArray) -> FloatArray:
+    """Nodes (n, 2), the sides straight of T6 elements that curved ones fold, as in a notch."""
+    folded, straight = cells[non_positive_jacobians(nodes, cells, "T6")], nodes.copy()
+    corners = nodes[folded[:, :3]]
+    straight[folded[:, 3:]] = 0.5 * (corners + np.roll(corners, -1, axis=1))
+    return straight
 
 
 def _meshed_in_child(

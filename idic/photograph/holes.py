@@ -240,17 +240,11 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
     if misfit > _BENT * pitch:
         raise _no_lattice(len(holes), f"up to {misfit:.0f} px off one of {pitch:.0f} px")
     found = HoleLattice(
-        centres=holes.centres[known],
-        index=index[known],
-        vectors=vectors * _FLIP,
-        origin=origin * _FLIP,
-        diameters=holes.diameters[known],
-        missing=_missing(index[known]),
-        extra=holes.centres[~known],
-        misfit_px=misfit,
-        kind=_kind(vectors),
+        centres=holes.centres[known], index=index[known], vectors=vectors * _FLIP,
+        origin=origin * _FLIP, diameters=holes.diameters[known], missing=_missing(index[known]),
+        extra=holes.centres[~known], misfit_px=misfit, kind=_kind(vectors),
         too_small=holes.too_small,
-    )
+    )  # fmt: skip
     apart = float(np.linalg.norm(vectors, axis=1).min())
     off = 0.0 if cell_px is None else cell_px / apart - 1.0
     if cell_px is not None and (not cell_px > 0 or abs(off) > _WRONG_CELL):

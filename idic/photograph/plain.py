@@ -61,6 +61,8 @@ _SHARPEST = 1.0 / 3.0
 """Largest curvature [1/px]: that of a corner is no radius."""
 _LEAST_PX2 = 60.0
 """Area of a hole or island; smaller ones are dirt."""
+_SECOND = 0.2
+"""Area over the largest one's from which on another island is a specimen."""
 _TURNS_DEG = np.arange(-24.0, 25.0, 6.0)
 """Rotations of the specimen between two pictures that are tried."""
 _CONTOURS = (
@@ -82,12 +84,17 @@ class PlainSurface:
     holes."""
     noise: float
     """Variance of a contour's distance times the length over which it is correlated [px^3]."""
+    text: tuple[str, ...] = ()
+    """Whether there are other specimens in the picture."""
 
 
-def plain_surface(image: FloatImage, name: str = "the picture") -> PlainSurface | None:
+def plain_surface(
+    image: FloatImage, name: str = "the picture", like: BoolArray | None = None
+) -> PlainSurface | None:
     """What a picture (rows, cols) shows if it shows a plain material; None if it has speckle.
 
-    InputError, in which it has a name, if the material reaches the picture's border.
+    Of several specimens the largest is taken, or the one where ``like`` is True. InputError, in
+    which the picture has a name, if the specimen reaches its border.
     """
     grey = gaussian_filter(np.asarray(image, dtype=np.float32), _BLUR_PX)
     few = max(1, min(grey.shape) // _COARSE_PX)
@@ -99,13 +106,13 @@ def plain_surface(image: FloatImage, name: str = "the picture") -> PlainSurface 
     material = large_parts(bright if border.mean() < 0.5 else ~bright, _LEAST_PX2)
     if not material.any() or _shows_speckle(image, material, step):
         return None
+    material, text = _one_specimen(material | ~large_parts(~material, _LEAST_PX2), like)
     reached = sum(int(side.sum()) for side in (*material[[0, -1]], *material[:, [0, -1]].T))
     if reached:
         raise InputError(
             f"expected all of a specimen without speckle in {name}, got material at "
             f"{reached} px of its border; take it from farther away, or crop nothing"
         )
-    material = _largest(material | ~large_parts(~material, _LEAST_PX2))
     contours = _contours(grey - middle, material)
     if not contours:
         return None
@@ -116,7 +123,7 @@ def plain_surface(image: FloatImage, name: str = "the picture") -> PlainSurface 
     blur = float(np.abs(step[material]).mean()) / (slope * np.sqrt(2.0 * np.pi))
     variance = max(0.0, blur**2 - _DIFFERENCE_PX2)
     sharp = tuple(_unbent(points, variance) for points in contours)
-    return PlainSurface(material, sharp, noise / slope**2)
+    return PlainSurface(material, sharp, noise / slope**2, text)
 
 
 def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | None:
@@ -148,10 +155,17 @@ def _contours(signed: FloatArray, material: BoolArray) -> tuple[FloatArray, ...]
     return tuple(sorted(found, key=lambda points: -abs(_area(points))))
 
 
-def _largest(material: BoolArray) -> BoolArray:
-    """The largest island, with its holes."""
+def _one_specimen(material: BoolArray, like: BoolArray | None) -> tuple[BoolArray, tuple[str, ...]]:
+    """The largest island, or the one where ``like`` is True; what there is besides."""
     islands, _ = label(material)
-    return np.asarray(islands == 1 + np.argmax(np.bincount(islands.ravel())[1:]))
+    sizes = np.bincount(islands.ravel())[1:]
+    at = sizes if like is None else np.bincount(islands[like], minlength=len(sizes) + 1)[1:]
+    mine, count = int(np.argmax(at)), int((sizes >= _SECOND * sizes.max()).sum())
+    text = (
+        f"There are {count} specimens in the picture; the one of {sizes[mine]} px was measured: "
+        "crop the pictures to measure another one."
+    )
+    return np.asarray(islands == 1 + mine), (text,) * (count > 1)
 
 
 def _inside(material: BoolArray) -> BoolArray:
@@ -310,7 +324,7 @@ def displacement_of_plain(
     ``body``: a mesh of the reference's material. InputError, in which the picture has a name, if it
     shows no plain specimen, or another one.
     """
-    deformed = plain_surface(image, name)
+    deformed = plain_surface(image, name, reference.mask)
     if deformed is None:
         raise InputError(
             f"expected two grey levels in {name}, like the reference's, got more: a plain specimen "
@@ -354,13 +368,8 @@ def measure_contours(
 
 def write_holes(path: Path, matched: MatchedContours, unit: str = "mm") -> None:
     """Write the holes' shapes in both pictures as a table (CSV), atomically."""
-    heads = (
-        f"x [{unit}]",
-        f"y up [{unit}]",
-        f"area [{unit}^2]",
-        "ellipticity [-]",
-        "orientation [degrees]",
-    )
+    own = f"x [{unit}]", f"y up [{unit}]", f"area [{unit}^2]"
+    heads = (*own, "ellipticity [-]", "orientation [degrees]")
     with atomic(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow([f"{when} {head}" for when in ("reference", "deformed") for head in heads])

@@ -218,18 +218,11 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
             )
     grid = images.grid
     info = set_record(
-        FORMAT,
-        files,
-        rows=grid.rows,
-        cols=grid.cols,
-        pixel_size_mm=grid.pixel_size,
-        first_pixel_mm={"x": grid.x0, "y_up": grid.y0},
-        unit_cell_mm=specimen.pitch,
-        bits=images.spec.bits,
-        background=images.spec.background,
-        reference=reference,
+        FORMAT, files, rows=grid.rows, cols=grid.cols, pixel_size_mm=grid.pixel_size,
+        first_pixel_mm={"x": grid.x0, "y_up": grid.y0}, unit_cell_mm=specimen.pitch,
+        bits=images.spec.bits, background=images.spec.background, reference=reference,
         deformed=deformed,
-    )
+    )  # fmt: skip
     with disk.atomic(public / README) as part:
         part.write_text(readme(info), "utf-8")
     return info

@@ -196,7 +196,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         given, options, image = self._given_mask, FiniteElementOptions(), self.reference.image
         blank: tuple[str, ...] = ()
         if self.plain is not None:
-            mask = self.plain.mask
+            mask, blank = self.plain.mask, self.plain.text
         else:
             mask, blank = speckled(image, find_material(image).mask if given is None else given)
         found = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
@@ -290,13 +290,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         """Measure an image; leaves a table of the holes where there is no speckle."""
         pair, body = self.pair(name), self._body
         if self.plain is not None:
+            path = str(self.case.files[name])
             found, contours = displacement_of_plain(
-                self.plain,
-                pair.deformed,
-                self.grid,
-                body,
-                self.progress,
-                str(self.case.files[name]),
+                self.plain, pair.deformed, self.grid, body, self.progress, path
             )
             holes = folder / f"{name}_holes.csv"
             write_holes(holes, contours, self.case.unit)

@@ -244,15 +244,11 @@ class HarvestRun(StagedRun[PhotographCase]):
     ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
         """A photograph that was correlated, and the files of its whole displacement if wanted."""
         case, pair = self.case, self._pair(name, last)
+        local = prepare.local_field(case, self.prepared, name, self.optics.distortion)
         measured = measure(
-            pair,
-            self.geometry,
-            case.specimen.cell_size,
-            case.correlation,
-            prepare.local_field(case, self.prepared, name, self.optics.distortion),
-            last and last[1],
-            self.progress,
-        )
+            pair, self.geometry, case.specimen.cell_size, case.correlation, local,
+            last and last[1], self.progress,
+        )  # fmt: skip
         if not case.whole_field.measure:
             return measured, ()
         return self._with_whole(name, pair, measured)

@@ -276,7 +276,7 @@ def prepare(
     for path in counted(deformed, progress, "prepare photographs"):
         try:
             frame = read_frame(path, reference)
-            shown = _material(frame, masks.get(path.stem), window)
+            shown = _material(frame, masks.get(path.stem), window, own)
             _require_alike(own, shown, path)
             shown = _one_specimen(shown, cell_px, own)
             if not (case.correlation.brightness.size or own.is_plain):
@@ -295,16 +295,10 @@ def prepare(
             f"{skipped[0][1]}"
         )
     prepared = PreparedPhotographs(
-        folder,
-        tuple(names),
-        tuple(skipped),
-        _noise(case, reference, own.mask),
-        PixelGrid.centred(*reference.shape, case.scale.mm_per_px),
-        float(reference.full_scale),
-        tuple(notes),
-        own.is_plain,
-        rigid,
-    )
+        folder, tuple(names), tuple(skipped), _noise(case, reference, own.mask),
+        PixelGrid.centred(*reference.shape, case.scale.mm_per_px), float(reference.full_scale),
+        tuple(notes), own.is_plain, rigid,
+    )  # fmt: skip
     content = to_plain(prepared)
     del content["folder"]
     write_json(folder / PREPARED_FILE, content)
@@ -323,15 +317,18 @@ class ShownMaterial:
     """Whether the material has no speckle."""
 
 
-def _material(photograph: Photograph, given: Path | None, window: int) -> ShownMaterial:
-    """The material of a photograph, as given or as found."""
+def _material(
+    photograph: Photograph, given: Path | None, window: int, like: ShownMaterial | None = None
+) -> ShownMaterial:
+    """The material of a photograph, as given or as found; plain, where the reference's was."""
     if given is not None:
         mask = read_mask(given)
         require_same_shape(photograph.image, mask, str(photograph.path), str(given))
         return ShownMaterial(mask)
-    plain = plain_surface(photograph.image, str(photograph.path))
+    where = like.mask if like else None
+    plain = plain_surface(photograph.image, str(photograph.path), where)
     if plain is not None:
-        return ShownMaterial(plain.mask, (_PLAIN,), True)
+        return ShownMaterial(plain.mask, (_PLAIN, *plain.text), True)
     found = find_material(photograph.image, window)
     return ShownMaterial(found.mask, found.text)
 
