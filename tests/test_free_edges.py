@@ -99,6 +99,14 @@ def test_law_of_edges_is_learnt(mesh: Mesh) -> None:
     assert max(edges.deviation) <= 1e-3
 
 
+def test_sides_that_end_in_corners_are_left_out() -> None:
+    mask = np.ones((GRID.rows, GRID.cols), dtype=bool)
+    mesh = mesh_of_mask(mask, GRID, 30.0, 30.0).mesh
+    edges = FreeEdges(mesh, EVERYWHERE)
+    sides = np.count_nonzero(np.bincount(mesh.cells[:, 3:].ravel()) == 1)
+    assert len(edges.nodes) == sides - 8 > 0  # two at each corner
+
+
 def test_departures_are_linearised(mesh: Mesh) -> None:
     edges, random = FreeEdges(mesh, EVERYWHERE), np.random.default_rng(0)
     u = kirsch(mesh.nodes).ravel()

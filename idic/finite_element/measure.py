@@ -57,8 +57,7 @@ _FIRST_PX = 18.0
 _FIRST_WITH_LAW_PX = 150.0
 _WRONG = 0.075
 """Share of the edges' nodes that contradict a law beyond which it is said to be wrong; not 0.003,
-because smoothing takes more away at edges than bars know (docs/explanation/whole_field.md).
-"""
+because smoothing takes more away at edges than bars know (docs/explanation/whole_field.md)."""
 _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
 _SHORT_PX = 0.1
@@ -117,8 +116,7 @@ class FiniteElementOptions:
     law: Law | None = None
     """By which to regularise in the end; None for the smoothness of what is added to the start."""
     edge_px: int = 0
-    """Pixels closer than this to the edge of the mask are left out of the unfiltered images [px].
-    """
+    """Pixels closer than this to the mask's edge are left out of unfiltered images [px]."""
     steps: int = 4
     """Of Gauss-Newton in each stage, at most."""
     free_edges: bool = True

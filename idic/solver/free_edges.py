@@ -68,6 +68,12 @@ class FreeEdges:
         points, slopes, along = on_sides(mesh, cell, side, _GAUSS)
         (x, y), (left, right, bottom, top) = np.moveaxis(points, 2, 0), inside
         there = ((x > left) & (x < right) & (y > bottom) & (y < top)).all(axis=1)
+        ends = on_sides(mesh, cell, side, np.array([0.0, 1.0]))[2]
+        ends /= np.linalg.norm(ends, axis=-1, keepdims=True)
+        begin, end = (mesh.cells[cell, (side + k) % 3].argsort() for k in (0, 1))
+        # Where a free edge meets a loaded one strains are singular: elements hold neither.
+        corner = (ends[begin, 0] * ends[end, 1]).sum(axis=1) < np.cos(np.pi / 6.0)
+        there[begin[corner]] = there[end[corner]] = False
         T = (along / np.linalg.norm(along, axis=-1, keepdims=True))[there]
         self.frame = np.stack([T, T[..., ::-1] * [1.0, -1.0]])
         """(2, s, g, 2) T and N at points of each side."""
