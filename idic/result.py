@@ -36,6 +36,18 @@ what is not would be nothing."""
 
 
 @dataclass(frozen=True, eq=False)
+class Covariance:
+    """The (n, n) covariances of a result's unknowns by their causes."""
+
+    by_noise: FloatArray
+    """By the images' noise."""
+    by_model_error: FloatArray | None
+    """By the residual, cell by cell; None where there are too few cells."""
+    warnings: tuple[str, ...] = ()
+    """Why, one sentence each."""
+
+
+@dataclass(frozen=True, eq=False)
 class Result:
     """The unknowns with their covariance, and an account of the iteration."""
 
@@ -82,6 +94,8 @@ class Result:
     """Of the spline."""
     final_smoothing: FinalSmoothing | None = None
     """Of the images on the finest level; None where there was none to choose."""
+    errors: Covariance | None = None
+    """Where they were found, such as by a harvest; :meth:`covariance` is of noise alone."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
@@ -187,13 +201,9 @@ class Result:
         With the images' noise, or the standard deviation of both [grey levels], chi squared, too.
         """
         return ResidualTest.of(
-            self.residual_rms,
-            self.residual_correlation,
-            self.pixels,
-            self.ansatz.size,
-            None if noise is None else self.residual_noise(noise),
-            self.residual_lags_px,
-        )
+            self.residual_rms, self.residual_correlation, self.pixels, self.ansatz.size, None if
+            noise is None else self.residual_noise(noise), self.residual_lags_px,
+        )  # fmt: skip
 
     def standard_errors(self, noise: ImageNoise | float | None = None) -> FloatArray:
         """(n,): square roots of the diagonal of :meth:`covariance`."""
@@ -289,28 +299,32 @@ def result_to_dict(result: Result) -> dict[str, Any]:
 
 def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
     """Make the arguments of the result that :func:`result_to_dict` described."""
+    content = {"errors": None, **content}  # not there in older files
     numbers = {name: _or(np.nan if name in _UNKNOWN else np.inf, content[name]) for name in _STORED}
-    weighting, smoothing = content["weighting"], content["final_smoothing"]
-    size_px = _or(np.inf, weighting["speckle_size_px"])
+    how, smoothing, errors = (content[k] for k in ("weighting", "final_smoothing", "errors"))
+    size_px, is_low_pass = _or(np.inf, how["speckle_size_px"]), bool(how.get("low_pass"))
     steps = ({k: _or(np.inf, v) for k, v in step.items()} for step in content["history"])
     return numbers | {
         "ansatz": ansatz_from_dict(content["ansatz"]),
         "grid": PixelGrid(**content["grid"]),
         "unknowns": np.array(list(content["unknowns"].values())),
-        "inverse": np.array([[_or(np.inf, v) for v in row] for row in content["inverse"]]),
+        "inverse": _matrix(content["inverse"]),
         "outcome": Outcome(content["outcome"]),
         "history": tuple(Iteration(**step) for step in steps),
         "residual_lags_px": tuple(content["residual_lags_px"]),
         "noise_transfer": NoiseTransfer(**content["noise_transfer"]),
-        "weighting": Weighting(
-            Gradient(weighting["gradient"]),
-            weighting["blur_px"],
-            size_px,
-            bool(weighting.get("low_pass")),  # not there in older files
-        ),
+        "weighting": Weighting(Gradient(how["gradient"]), how["blur_px"], size_px, is_low_pass),
         "final_smoothing": smoothing
         and FinalSmoothing(**{k: _or(np.nan, v) for k, v in smoothing.items()}),
-    }
+        "errors": errors and Covariance(
+            _matrix(errors["by_noise"]), _matrix(errors["by_model_error"]),
+            tuple(errors["warnings"]),
+        ),
+    }  # fmt: skip
+
+
+def _matrix(rows: list[list[float | None]] | None) -> Any:
+    return rows and np.array([[_or(np.inf, v) for v in row] for row in rows])
 
 
 _STORED = tuple(f.name for f in fields(Result))

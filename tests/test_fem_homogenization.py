@@ -22,7 +22,12 @@ from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.field import NODES_PER_CELL, Mesh
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
-from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize, ranked_branches
+from modeharvest.fem.lattice.micromorphic.branches import (
+    Homogenized,
+    follow_branch,
+    homogenize,
+    ranked_branches,
+)
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
 from modeharvest.fem.lattice.micromorphic.mesh import (
     quadrature,
@@ -31,7 +36,7 @@ from modeharvest.fem.lattice.micromorphic.mesh import (
     specimen_mesh,
 )
 from modeharvest.fem.lattice.micromorphic.options import PlateLoading
-from modeharvest.fem.lattice.micromorphic.path import HomogenizedPath
+from modeharvest.fem.lattice.micromorphic.path import HomogenizedPath, HomogenizedState
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, rotation_pattern, snapped
 from modeharvest.fem.lattice.micromorphic.rve import RVE, centred_cell
 from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading, uniaxial, uniaxial_strain
@@ -317,6 +322,56 @@ def test_a_quarter_is_as_the_whole_on_the_primary_path() -> None:
     assert quarter.energy == pytest.approx(whole.energy, rel=1e-10)
     assert quarter.force == pytest.approx(whole.force, rel=1e-10)
     assert np.isnan(whole.amplitudes).any()  # in the bulk
+
+
+class Recorded(HomogenizedPath):
+    """A path that keeps the states of its branches as they are met."""
+
+    def __init__(self, body: HomogenizedBody, options: PathOptions) -> None:
+        self.met: list[HomogenizedState] = []
+        super().__init__(body, options)
+
+    def equilibrium(self, *args: Any, **kwargs: Any) -> HomogenizedState | None:
+        found = super().equilibrium(*args, **kwargs)
+        if found is not None and found.branch == "buckled":
+            self.met.append(found)
+        return found
+
+
+def test_a_branch_is_followed_where_its_load_turns() -> None:
+    """Before long elastic blocks: the lattice softens faster than they unload, and stiffens later.
+
+    So the load has a maximum and then a minimum, with unstable states between them.
+    """
+    a, b, block = 3 * PITCH, PITCH, 500.0
+    mesh = rectangle_mesh([0, a, a + block], [0, b])
+    is_lattice = mesh.nodes[mesh.cells[:, :4]].mean(axis=1)[:, 0] < a
+    loading = PlateLoading(
+        plates="sliding", pattern_at_plates="free", pattern_at_bulk="free", quarter=True
+    )
+    body = HomogenizedBody(mesh, rve(), loading, None, Ogden(), is_lattice)
+    path = Recorded(body, PathOptions(first_amplitude=0.03, growth=1.2))
+    path.follow_primary(0.05, "all")
+    critical = path.critical()
+    assert critical is not None
+    (last,), _ = follow_branch(path, critical, [0.028])
+    met = [state for state in path.met if state.load < last.load] + [last]
+    loads, forces, energies, unstable = np.array(
+        [(s.load, s.force, s.energy, s.negative_eigenvalues) for s in met]
+    ).T
+    top, bottom = int(np.argmax(loads[:10])), int(np.argmin(loads))
+    assert critical.load < loads[top] < last.load == pytest.approx(0.028)
+    assert loads[bottom] < 0.985 * critical.load
+    folds = [np.diff(part) for part in (loads[: top + 1], loads[top : bottom + 1], loads[bottom:])]
+    assert [np.sign(part).tolist() for part in folds] == [
+        len(part) * [sign] for part, sign in zip(folds, (1, -1, 1), strict=True)
+    ]
+    assert set(unstable[top + 2 : bottom - 1]) == {1}
+    assert set(unstable[: top - 1]) == set(unstable[bottom + 2 :]) == {0}
+    # What the plates do is what is stored, around both turns.
+    work = 0.5 * (forces[1:] + forces[:-1]) * np.diff(loads) * body.length
+    there_and_back = float(np.abs(work).sum())
+    assert work.sum() == pytest.approx(energies[-1] - energies[0], abs=0.01 * there_and_back)
 
 
 def test_a_critical_point_of_u_alone_does_not_hide_the_pattern_s() -> None:

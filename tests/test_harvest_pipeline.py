@@ -103,6 +103,17 @@ def test_the_pattern_is_found_with_no_number_typed(harvested: Path, images: Imag
     assert np.sqrt(np.nanmean(w**2)) < 0.45
 
 
+def test_a_result_has_the_error_bars_of_the_summary(harvested: Path) -> None:
+    found = Result.read(harvested / "results" / "frame_2.json")
+    assert found.errors is not None
+    both = {"sd_noise": found.errors.by_noise, "sd_model_error": found.errors.by_model_error}
+    (mode,) = summary(harvested)["frames"][1]["modes"]
+    for name, C in both.items():
+        assert C is not None
+        sd = np.sqrt(np.diag(C))[found.ansatz.phi_slice(0)]
+        assert [p[name] for p in mode["parameters"]] == pytest.approx(sd.tolist(), rel=1e-6)
+
+
 def test_the_noise_is_measured(harvested: Path) -> None:
     found = summary(harvested)["noise"]
     # Read noise and rounding; the estimate from one image is good to some per cent.

@@ -22,6 +22,7 @@ from modeharvest.fem.lattice.options import equibiaxial
 from modeharvest.fem.materials import Ogden
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.modes import square_family
+from modeharvest.idic.result import Covariance, Result
 from modeharvest.idic.spectra.mode_family import FoundFamily, write_family
 from modeharvest.report.homogenization import homogenization_report
 from modeharvest.report.model import print_report
@@ -171,11 +172,33 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     assert faults(summary, "homogenize") == []
     # The same mode from its file: without the images it was measured in, and their strain.
     result = out / "experiment/correlation/result_1300.json"
-    one = SMALL.replace('"measured"', f'"file"\npath = "{result}"')
+    one = SMALL.replace('"measured"', f'"file"\nsnap_anyway = true\npath = "{result}"')
     one = one.replace("mesh_size = 0.5\n[mode]", "mesh_size = 0.5\nfirst_order = false\n[mode]")
     from_file = HomogenizationRun(case_of(tmp_path / "file.toml", one), tmp_path / "file").all()
     assert from_file["critical_strain"] == pytest.approx(summary["critical_strain"], rel=1e-9)
     assert from_file["mode"]["errors"] == "noise"
+    assert from_file["mode"]["wave_deviation"] is None
+    assert from_file["critical_strain_sd_model_error"] is None
+    assert from_file["critical_strain_sd_noise"] == from_file["critical_strain_sd"]
+    assert summary["critical_strain_sd_noise"] < 0.5 * summary["critical_strain_sd_model_error"]
+    assert summary["critical_strain_sd_model_error"] == summary["critical_strain_sd"]
+    for s in summary["states"][1:]:
+        assert 0 < s["force_sd_noise_N_per_mm"] < s["force_sd_model_error_N_per_mm"]
+        assert 0 < s["energy_sd_noise_N"] < s["energy_sd_model_error_N"] == s["energy_sd_N"]
+    assert 0 < summary["mode"]["wave_deviation"][0] < 3.44
+    # With the error bars that a harvest leaves, those of the images themselves.
+    known = read_json(out / "mode.json")["parameters"]
+    measured = Result.read(result)
+    by_model_error = np.zeros_like(measured.inverse)
+    at = np.arange(len(by_model_error))[measured.ansatz.phi_slice(0)]
+    by_model_error[np.ix_(at, at)] = known["by_model_error"]
+    errors = Covariance(measured.covariance(), by_model_error)
+    replace(measured, errors=errors).write(tmp_path / "harvested.json")
+    other = SMALL.replace('"measured"', '"file"\npath = "harvested.json"')
+    run = HomogenizationRun(case_of(tmp_path / "other.toml", other), tmp_path / "other")
+    _, parameters, _ = run._found_modes()
+    assert parameters is not None
+    assert parameters.deviations == pytest.approx(summary["mode"]["wave_deviation"])
     assert from_file["critical_strain_sd"] < 0.5 * summary["critical_strain_sd"]
     assert from_file["amplitude"] is from_file["displacement"] is None
     before_buckling = SMALL.replace('"measured"', '"measured"\nstrain = 0.03')
@@ -464,23 +487,33 @@ def test_three_measured_modes_are_snapped_each(tmp_path: Path) -> None:
 
 
 @pytest.mark.dolfinx
-def test_a_wave_vector_far_from_the_lattice_s_is_warned_of(tmp_path: Path) -> None:
+@pytest.mark.parametrize("anyway", [False, True])
+def test_a_wave_vector_far_from_the_lattice_s_is_refused_unless_wanted(
+    anyway: bool, tmp_path: Path
+) -> None:
     """By its standard deviations where the model error is known, else by a hundredth of itself."""
-    case = case_of(tmp_path / "case.toml", SMALL)
-    run = HomogenizationRun(case, tmp_path / "out")
-    ansatz = Ansatz.of_specimen(case.experiment.specimen)
+    text = SMALL.replace('"measured"', f'"measured"\nsnap_anyway = {str(anyway).lower()}')
+    run = HomogenizationRun(case_of(tmp_path / "case.toml", text), tmp_path / "out")
+    ansatz = Ansatz.of_specimen(run.case.experiment.specimen)
     object.__setattr__(run, "result", Modes(ansatz))
     family, noise, error = ansatz.modes[0].family, 1e-8 * np.eye(7), 1e-4 * np.eye(7)
 
-    def warned(off: float, by_model_error: FloatArray | None) -> bool:
+    def far(off: float, by_model_error: FloatArray | None) -> list[str]:
         values = family.start + off * np.array([0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
         given = ModeParameters(family.names, family.units, values, noise, by_model_error)
-        warnings = run._far_waves(run._modes_of(values), given)
-        assert all("is this mode of this lattice?" in text for text in warnings)
-        return bool(warnings)
+        found = run._modes_of(values)
+        try:
+            return list(run._far_waves(found, run._deviations(found, given)))
+        except InputError as refused:
+            return ["refused", str(refused)]
 
-    assert [warned(off, None) for off in (0.005, 0.02)] == [False, True]
-    assert [warned(off, error) for off in (0.02, 0.04)] == [False, True]
+    assert [far(0.005, None), far(0.02, error)] == [[], []]
+    for off, by, words in ((0.02, None, "within 1%"), (0.04, error, "5.7 of them")):
+        texts = far(off, by)
+        assert (texts[0] == "refused") != anyway
+        assert words in texts[-1]
+        assert "is it of this lattice?" in texts[-1]
+        assert ("snap_anyway = true in [mode]" in texts[-1]) != anyway
 
 
 @pytest.mark.dolfinx

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from manufactured import GRID
 
-from modeharvest.idic.result import Result
+from modeharvest.idic.result import Covariance, Result
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer
 from modeharvest.imaging.grid import PixelGrid
@@ -60,6 +60,24 @@ def test_a_file_holds_everything_exactly(outcome: Outcome, tmp_path: Path) -> No
     content = json.loads((tmp_path / "result.json").read_text())
     assert content["explanation"] == outcome.explanation
     assert content["unknowns"]["phi2.kx1"] == result.unknowns[result.names.index("phi2.kx1")]
+
+
+def test_a_file_holds_error_bars_and_older_ones_have_none(tmp_path: Path) -> None:
+    path, n = tmp_path / "result.json", some_result().ansatz.size
+    noise, larger = np.diag(np.arange(1.0, n + 1)), np.diag(np.arange(2.0, n + 2))
+    noise[0, 0] = np.inf
+    for model_error in (larger, None):
+        replace(some_result(), errors=Covariance(noise, model_error, ("few cells",))).write(path)
+        found = Result.read(path).errors
+        assert found is not None
+        np.testing.assert_array_equal(found.by_noise, noise)
+        assert (found.by_model_error is None) == (model_error is None)
+        np.testing.assert_array_equal(found.by_model_error, model_error)
+        assert found.warnings == ("few cells",)
+    content = json.loads(path.read_text())
+    del content["errors"]
+    path.write_text(json.dumps(content))
+    assert Result.read(path).errors is None
 
 
 def test_a_result_that_knows_nothing_is_strict_json(tmp_path: Path) -> None:

@@ -45,7 +45,12 @@ class StateNumbers:
     """Of the tangent, of both scales where there are two; 0: stable, None: unknown."""
     force_sd_N_per_mm: float | None = None
     energy_sd_N: float | None = None
-    """Standard deviations by the mode's; None where it has none."""
+    """Standard deviations by the mode's larger covariance that is known; None where it has none."""
+    force_sd_noise_N_per_mm: float | None = None
+    energy_sd_noise_N: float | None = None
+    force_sd_model_error_N_per_mm: float | None = None
+    energy_sd_model_error_N: float | None = None
+    """By noise, and by model error, noise included; None where that is not known."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,8 @@ class Response:
     outcome: str = ""
     """How far it was followed."""
     critical_strain_sd: float | None = None
+    critical_strain_sd_noise: float | None = None
+    critical_strain_sd_model_error: float | None = None
 
     @property
     def values(self) -> FloatArray:
@@ -166,13 +173,17 @@ class ModeParameters:
     that is not known: a result without its images, a specimen of few cells."""
     of_fields: FloatArray | None = None
     """(n, n) the larger one of all the correlation's unknowns, v0's and v1's among them."""
+    deviations: tuple[float, ...] = ()
+    """Of each mode by how many of its standard deviations snapping changed a wave vector, at most;
+    none where the model error is not known."""
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> ModeParameters:
         """From plain values."""
         arrays = (content[key] for key in ("values", "by_noise", "by_model_error", "of_fields"))
         known = (None if a is None else np.array(a, dtype=np.float64) for a in arrays)
-        return cls(tuple(content["names"]), tuple(content["units"]), *known)  # type: ignore[arg-type]
+        names, units, sds = (tuple(content[key]) for key in ("names", "units", "deviations"))
+        return cls(names, units, *known, deviations=sds)  # type: ignore[arg-type, misc]
 
     @property
     def covariance(self) -> FloatArray:
@@ -245,17 +256,23 @@ def with_errors(
     """
     m, here = len(parameters.values), modes(parameters.values)
     J, is_snapped = np.zeros((len(response.values), m)), np.zeros(m, bool)
-    sds = [np.full(m, np.nan) if C is None else np.sqrt(np.diag(C))
-           for C in (parameters.by_noise, parameters.by_model_error)]  # fmt: skip
+    both = parameters.by_noise, parameters.by_model_error
+    sds = [np.full(m, np.nan) if C is None else np.sqrt(np.diag(C)) for C in both]
     for k, step in enumerate(np.diag(parameters.steps)):
         there = modes(parameters.values + step)
         is_snapped[k] = all(a.is_same(b) for a, b in zip(here, there, strict=True))
         if not is_snapped[k]:
             J[:, k] = (predicted(there).values_at(response) - response.values) / step[k]
-    variances, count = np.einsum("ik,kl,il->i", J, parameters.covariance, J), len(response.states)
-    every = [_known(sd) for sd in np.sqrt(variances)]
-    pairs = zip(response.states, every[1 : 1 + count], every[1 + count :], strict=True)
-    states = tuple(replace(s, force_sd_N_per_mm=f, energy_sd_N=e) for s, f, e in pairs)
+    count = len(response.states)
+    for cause, C in zip(
+        ("", "_noise", "_model_error"), (parameters.covariance, *both), strict=True
+    ):
+        if C is not None:
+            sd: list[Any] = [_known(sd) for sd in np.sqrt(np.einsum("ik,kl,il->i", J, C, J))]
+            force, energy = f"force_sd{cause}_N_per_mm", f"energy_sd{cause}_N"
+            pairs = zip(response.states, sd[1 : 1 + count], sd[1 + count :], strict=True)
+            states = tuple(replace(s, **{force: f, energy: e}) for s, f, e in pairs)
+            response = replace(response, states=states, **{f"critical_strain_sd{cause}": sd[0]})
     effects = tuple(
         ParameterEffect(
             name=parameters.names[k], unit=parameters.units[k], value=float(parameters.values[k]),
@@ -266,7 +283,7 @@ def with_errors(
         )
         for k in range(m)
     )  # fmt: skip
-    return replace(response, states=states, critical_strain_sd=every[0]), effects
+    return response, effects
 
 
 def _known(value: float) -> float | None:

@@ -77,13 +77,9 @@ class CondensedCell:
     """
 
     def __init__(
-        self,
-        cell: PeriodicCell,
-        carriers: FloatArray,
-        u: FloatArray,
-        constraints: FloatArray,
+        self, cell: PeriodicCell, carriers: FloatArray, u: FloatArray, constraints: FloatArray,
         violation: FloatArray | float = 0.0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._cell, self._carriers, self._u = cell, carriers, u
         self._constraints, self._violation = constraints, violation
         forces = cell.body.forces(u)
@@ -121,14 +117,9 @@ class LinearisedCell(CondensedCell):
     """The equations at a trial state of load [-], F̄ (4,) along its axes, w (2 count,) [mm]."""
 
     def __init__(
-        self,
-        cell: PeriodicCell,
-        loading: MacroLoading,
-        load: float,
-        gradient: FloatArray,
-        fluctuation: FloatArray,
-        amplitude: Amplitude | None = None,
-    ) -> None:
+        self, cell: PeriodicCell, loading: MacroLoading, load: float, gradient: FloatArray,
+        fluctuation: FloatArray, amplitude: Amplitude | None = None,
+    ) -> None:  # fmt: skip
         self.loading, self.load, self.amplitude = loading, load, amplitude
         self.gradient, self.fluctuation, self.area = gradient, fluctuation, cell.cell.area
         Q = loading.axes  # along which components are, F̄'s among them
@@ -187,14 +178,12 @@ class LinearisedCell(CondensedCell):
         """The state reached, with its rates and moduli."""
         Q = self.loading.axes
         return CellState(
-            load=self.load,
-            gradient=(Q @ self.gradient).reshape(2, 2),
-            fluctuation=self.fluctuation,
-            rate=np.concatenate([Q @ self.rate, self.response @ self.rate]),
-            stress=np.asarray((Q @ self.macro_forces).reshape(2, 2) / self.area),
-            stiffness=self.stiffness,
-            moduli=(Q @ self.condensed @ Q.T).reshape(2, 2, 2, 2) / self.area,
-        )
+            load=self.load, gradient=(Q @ self.gradient).reshape(2, 2),
+            fluctuation=self.fluctuation, rate=np.concatenate([Q @ self.rate, self.response @
+            self.rate]), stress=np.asarray((Q @ self.macro_forces).reshape(2, 2) / self.area),
+            stiffness=self.stiffness, moduli=(Q @ self.condensed @ Q.T).reshape(2, 2, 2, 2) /
+            self.area,
+        )  # fmt: skip
 
 
 _ITERATIONS = 12
@@ -246,12 +235,9 @@ class PeriodicCell:
         return found if isinstance(found, CellState) else None
 
     def corrected(
-        self,
-        loading: MacroLoading,
-        load: float,
-        guess: FloatArray,
-        amplitude: Amplitude | None = None,
-    ) -> CellState | str:
+        self, loading: MacroLoading, load: float, guess: FloatArray, amplitude: Amplitude | None =
+        None,
+    ) -> CellState | str:  # fmt: skip
         """The equilibrium near a guess (4 + 2 count,) of F̄, w and, with an amplitude, the load.
 
         Where there is none, the reason.

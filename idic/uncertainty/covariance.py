@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.idic.ansatz import open_grid
-from modeharvest.idic.result import Result, determined_part
+from modeharvest.idic.result import Covariance, Result, determined_part
 from modeharvest.idic.solver.assembly import Assembly, valid_pixels
 from modeharvest.idic.solver.final_smoothing import smoothed_pair
 from modeharvest.idic.solver.gauss_newton import Outcome
@@ -44,18 +44,6 @@ _SMALL = np.float32(0.05)
 """Noise is made that much smaller, and its effect larger again: the linear part is wanted."""
 _EXAMPLES = 4
 """Of filtered noise: with 100 cells a standard deviation is good to 4 %."""
-
-
-@dataclass(frozen=True, eq=False)
-class Covariance:
-    """The (n, n) covariances of a result's unknowns by their causes."""
-
-    by_noise: FloatArray
-    """By the images' noise."""
-    by_model_error: FloatArray | None
-    """By the residual, cell by cell; None where there are too few cells."""
-    warnings: tuple[str, ...] = ()
-    """Why, one sentence each."""
 
 
 def covariance(
@@ -181,11 +169,9 @@ class MatchedImages:
         return _sandwich(self.inverse_hessian, gradients)
 
     def noise_covariance(
-        self,
-        examples: Iterable[tuple[FloatImage, FloatImage]],
-        block: float,
-        inverse: FloatArray | None = None,
-    ) -> FloatArray:
+        self, examples: Iterable[tuple[FloatImage, FloatImage]], block: float, inverse: FloatArray |
+        None = None,
+    ) -> FloatArray:  # fmt: skip
         """(n, n) covariance of the unknowns by noise of any kind, from examples of it.
 
         For images that were filtered before they were correlated: their noise is not white any
@@ -274,12 +260,11 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
         pattern.append(propagated_sd(S[..., own], matrix[np.ix_(own, own)]))
     shape = S.shape[:-2]
     return FieldErrors(
-        covariance=matrix,
-        v0=propagated_sd(S[..., slow], matrix[slow, slow]),
+        covariance=matrix, v0=propagated_sd(S[..., slow], matrix[slow, slow]),
         v=np.array(amplitude).reshape(len(modes), *shape),
-        fluctuation=np.array(pattern).reshape(len(modes), *shape, 2),
-        displacement=propagated_sd(S, matrix),
-    )
+        fluctuation=np.array(pattern).reshape(len(modes), *shape, 2), displacement=propagated_sd(S,
+        matrix),
+    )  # fmt: skip
 
 
 def propagated_sd(sensitivity: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -57,11 +57,9 @@ class Homogenized:
 
 
 def homogenize(
-    body: HomogenizedBody,
-    loads: Sequence[float],
-    options: PathOptions | None = None,
-    progress: Progress = silent,
-) -> Homogenized:
+    body: HomogenizedBody, loads: Sequence[float], options: PathOptions | None = None, progress:
+    Progress = silent,
+) -> Homogenized:  # fmt: skip
     """States of a homogenized specimen at some loads [-], positive and ascending.
 
     On the primary path up to the first critical point at which a pattern grows, then on the branch

@@ -60,17 +60,10 @@ class HomogenizedBody:
     """
 
     def __init__(
-        self,
-        mesh: Mesh,
-        rves: RVE | Sequence[RVE],
-        loading: PlateLoading,
-        length: float | None = None,
-        bulk: Material | None = None,
-        is_lattice: BoolArray | None = None,
-        points: int | None = None,
-        comm: MPI.Comm = MPI.COMM_WORLD,
-        edges: Mapping[str, IntArray] | None = None,
-    ) -> None:
+        self, mesh: Mesh, rves: RVE | Sequence[RVE], loading: PlateLoading, length: float | None =
+        None, bulk: Material | None = None, is_lattice: BoolArray | None = None, points: int | None
+        = None, comm: MPI.Comm = MPI.COMM_WORLD, edges: Mapping[str, IntArray] | None = None,
+    ) -> None:  # fmt: skip
         self.mesh, self.loading, self.bulk, self.comm = mesh, loading, bulk, comm
         self.rves = (rves,) if isinstance(rves, RVE) else tuple(rves)
         lattice = np.ones(len(mesh.cells), bool) if is_lattice is None else np.asarray(is_lattice)
@@ -104,15 +97,10 @@ class HomogenizedBody:
 
     @classmethod
     def of_specimen(
-        cls,
-        specimen: Specimen,
-        rves: RVE | Sequence[RVE],
-        loading: PlateLoading,
-        bulk: Material | None = None,
-        divisions: tuple[int, int] | None = None,
-        points: int = 2,
-        comm: MPI.Comm = MPI.COMM_WORLD,
-    ) -> HomogenizedBody:
+        cls, specimen: Specimen, rves: RVE | Sequence[RVE], loading: PlateLoading, bulk: Material |
+        None = None, divisions: tuple[int, int] | None = None, points: int = 2, comm: MPI.Comm =
+        MPI.COMM_WORLD,
+    ) -> HomogenizedBody:  # fmt: skip
         """A rectangle of holes with its bulk edges, of the RVEs' material unless given."""
         mesh, lattice = specimen_mesh(specimen, divisions, loading.quarter)
         solid = bulk or (rves if isinstance(rves, RVE) else rves[0]).material

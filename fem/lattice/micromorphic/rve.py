@@ -74,13 +74,9 @@ class RVE:
     """
 
     def __init__(
-        self,
-        cell: UnitCell,
-        material: Material,
-        modes: Sequence[ModeField] = (),
-        centre: ArrayLike = (0.0, 0.0),
-        normalisation: str = "rms",
-    ) -> None:
+        self, cell: UnitCell, material: Material, modes: Sequence[ModeField] = (), centre: ArrayLike
+        = (0.0, 0.0), normalisation: str = "rms",
+    ) -> None:  # fmt: skip
         if normalisation not in NORMALISATIONS:
             known = ", ".join(NORMALISATIONS)
             raise InputError(f"RVE: expected a normalisation among {known}, got {normalisation!r}")

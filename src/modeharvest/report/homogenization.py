@@ -80,11 +80,9 @@ def _state_row(pair: tuple[Mapping[str, Any], Mapping[str, Any] | None]) -> Mapp
     state, direct = pair
     row = {"strain": f"{100 * state['nominal_strain']:.4g}", "branch": state["branch"],
            "negative": state["negative_eigenvalues"]}  # fmt: skip
-    for name, key, sd in (
-        ("force", "force_N_per_mm", "force_sd_N_per_mm"), ("energy", "energy_N", "energy_sd_N"),
-    ):  # fmt: skip
-        errors = () if state[sd] is None else (state[sd],)
-        row[name] = Measured(state[key], errors, 5)
+    for name, key in (("force", "force_N_per_mm"), ("energy", "energy_N")):
+        sds = (state[key.replace("_", f"_sd_{cause}_", 1)] for cause in ("noise", "model_error"))
+        row[name] = Measured(state[key], tuple(sd for sd in sds if sd is not None), 5)
         row[f"{name}_direct"] = None if direct is None else f"{direct[key]:.5f}"
         row[f"{name}_off"] = None if direct is None else f"{_off(state[key], direct[key]):+.2f}"
     return row
@@ -103,7 +101,8 @@ def findings(summary: Summary) -> list[str]:
         text.append(text_of("homogenized-no-critical", outcome=summary["outcome"]))
     else:
         sd = summary["critical_strain_sd"]
-        error = "" if sd is None else f" ± {100 * sd:.4f}"
+        noise = summary["critical_strain_sd_noise"]
+        error = "" if sd is None else f" ± {100 * sd:.4f} (by noise alone {100 * noise:.4f})"
         last = summary["criticals"][-1]
         text.append(text_of("homogenized-critical", value=100 * critical, error=error, last=last))
         if direct is not None:
@@ -119,8 +118,9 @@ def findings(summary: Summary) -> list[str]:
                             off="" if off is None else f", {off:+.1f} %"))  # fmt: skip
     mode = summary["mode"]
     if mode is not None and mode["errors"] is not None:
-        change = 100 * max(mode["wave_change"])
-        text.append(text_of("homogenized-snapped", change=change, errors=mode["errors"]))
+        change, sds = 100 * max(mode["wave_change"]), mode["wave_deviation"]
+        by = f", {max(sds):.1f} of their standard deviations" if sds else ""
+        text.append(text_of("homogenized-snapped", change=change, off=by, errors=mode["errors"]))
     for name in ("displacement", "amplitude"):
         if (both := summary[name]) is not None:
             share = 100 * both["difference_rms_mm"] / both["measured_rms_mm"]

@@ -26,13 +26,9 @@ _ROOM = 0.24  # above and below a map [in]
 
 
 def draw_response(
-    path: Mapping[str, Any],
-    critical: float | None,
-    response: Mapping[str, Any],
-    first_order: float | None,
-    key: str,
-    label: str,
-) -> Figure:
+    path: Mapping[str, Any], critical: float | None, response: Mapping[str, Any], first_order: float
+    | None, key: str, label: str,
+) -> Figure:  # fmt: skip
     """Draw force or energy over nominal strain: direct simulation and homogenized states.
 
     ``path``: ``Solution.info["path"]``, empty without a direct simulation, and its ``critical``

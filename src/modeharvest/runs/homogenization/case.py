@@ -36,8 +36,16 @@ class _Numbered:
     """Which of them to use, from 1; by default all."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Snapped(_Numbered):
+    """Modes whose wave vectors become the lattice's."""
+
+    snap_anyway: bool = False
+    """Even those that are off by more than error bars allow, which are refused otherwise."""
+
+
 @dataclass(frozen=True)
-class MeasuredMode(_Numbered):
+class MeasuredMode(_Snapped):
     """The modes that the experiment's own images show."""
 
     strain: float | None = None
@@ -55,7 +63,7 @@ class BlochMode(_Numbered):
 
 
 @dataclass(frozen=True)
-class FileMode(_Numbered):
+class FileMode(_Snapped):
     """Modes found elsewhere: measured, or computed on any cell by ``modeharvest modes``."""
 
     path: str

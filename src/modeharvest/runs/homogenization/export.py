@@ -66,13 +66,10 @@ QUANTITIES = {
 
 
 def write_rve(
-    path: Path | str,
-    rve: RVE,
-    states: Sequence[RVEState] = (),
-    measured: MeasuredModes | None = None,
-    position: tuple[int, int] = (1, 1),
+    path: Path | str, rve: RVE, states: Sequence[RVEState] = (),
+    measured: MeasuredModes | None = None, position: tuple[int, int] = (1, 1),
     **of_states: ArrayLike,
-) -> None:
+) -> None:  # fmt: skip
     """Write an RVE with its modes, and its stresses and moduli at some states, as HDF5.
 
     measured : how the modes, all of them, were measured.

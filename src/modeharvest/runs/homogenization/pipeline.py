@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
@@ -28,11 +28,11 @@ from modeharvest.fem.lattice.micromorphic.patterns import ModeField, PlaneWaves,
 from modeharvest.fem.lattice.options import MacroLoading
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.modes import FAMILIES
-from modeharvest.idic.result import Result
+from modeharvest.idic.result import Covariance, Result
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.spectra.mode_family import FORMAT as FAMILY_FORMAT
 from modeharvest.idic.spectra.mode_family import read_family
-from modeharvest.idic.uncertainty.covariance import Covariance, covariance
+from modeharvest.idic.uncertainty.covariance import covariance
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.pair import ImagePair
@@ -76,8 +76,9 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.micromorphic.path import HomogenizedState
     from modeharvest.fem.lattice.micromorphic.rve import RVEState
 
-_FAR = 3.0
-"""Standard deviations by which snapping may change a wave vector without a warning."""
+_FAR = 3.44
+"""Standard deviations by which snapping may change a wave vector: two components are farther off by
+chance in 0.27 % of cases, as one is by 3."""
 _UNUSUAL = 0.01
 """Share of its length, where they are unknown; of the right lattice it was 0.7 % at most."""
 _SAME = 0.01
@@ -323,7 +324,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             ideals = [(every[k], every[k].family.start) for k in self._numbers]
             return tuple(LatticeMode.of(*s, specimen, vectors) for s in ideals), None, ()
         if self._families:
-            return tuple(LatticeMode.of_waves(w, vectors) for w in self._families), None, ()
+            given = tuple(LatticeMode.of_waves(w, vectors) for w in self._families)
+            return given, None, self._far_waves(given)
         if result is None:
             return (), None, ()
         modes, numbers = result.ansatz.modes, self._numbers
@@ -342,23 +344,41 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                 raise
             raise InputError(f"mode: expected an image of the buckled specimen, got one in which "
                              f"{seen.warnings[lost[0]]}; {error}") from error  # fmt: skip
-        return found, parameters, (*seen.warnings, *self._far_waves(found, parameters))
+        parameters = replace(parameters, deviations=self._deviations(found, parameters))
+        return found, parameters, (*seen.warnings, *self._far_waves(found, parameters.deviations))
+
+    def _deviations(
+        self, found: Sequence[LatticeMode], parameters: ModeParameters
+    ) -> tuple[float, ...]:
+        """By how many standard deviations snapping changed a wave vector of each mode, at most."""
+        assert self.result is not None
+        if parameters.by_model_error is None:
+            return ()
+        own = [self.result.ansatz.modes[k] for k in self._numbers]
+        last = np.cumsum([mode.family.size for mode in own])
+        parts = np.split(np.arange(last[-1]), last[:-1])
+        return tuple(
+            mode.deviation(m, parameters.by_model_error[np.ix_(part, part)])
+            for mode, m, part in zip(found, own, parts, strict=True)
+        )
 
     def _far_waves(
-        self, found: Sequence[LatticeMode], parameters: ModeParameters
+        self, found: Sequence[LatticeMode], deviations: Sequence[float] = ()
     ) -> tuple[str, ...]:
-        """A warning for each mode that snapping changed by more than its error bars."""
-        assert self.result is not None
-        warnings, first = list[str](), 0
-        for k, mode in zip(self._numbers, found, strict=True):
-            own = self.result.ansatz.modes[k]
-            part = slice(first, first := first + own.family.size)
-            off = mode.deviation(own, parameters.covariance[part, part])
-            change, is_known = mode.wave_change.max(), parameters.by_model_error is not None
-            if off > _FAR if is_known else change > _UNUSUAL:
-                by = f"{change:.2%}" + f", {off:.1f} of its standard deviations" * is_known
-                warnings.append(f"phi{k + 1}: snapping to the lattice changed a wave vector by "
-                                f"{by}: is this mode of this lattice?")  # fmt: skip
+        """Refuse modes that snapping changed by more than error bars allow, or warn of them."""
+        warnings = list[str]()
+        for k, mode in enumerate(found):
+            change = float(mode.wave_change.max())
+            off, most = (deviations[k], _FAR) if deviations else (change, _UNUSUAL)
+            of, got = "lengths (their model error isn't known)", f"one {change:.2%} off"
+            if deviations:
+                of, got = "standard deviations", f"one {off:.1f} of them ({change:.2%}) off"
+            if off > most:
+                limit = f"{most:g}" if deviations else f"{most:.0%}"
+                what = f"phi{k + 1}: expected wave vectors within {limit} of their {of}"
+                warnings.append(f"{what} of the lattice's, got {got}: is it of this lattice?")
+        if warnings and not getattr(self.case.mode, "snap_anyway", False):
+            raise InputError(f"{warnings[0]} If so, set snap_anyway = true in [mode]")
         return tuple(warnings)
 
     @property
@@ -371,7 +391,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     def _parameters(self, result: Result, pair: ImagePair | None) -> ModeParameters:
         """With the covariances that the result, and its images where they are there, have."""
-        known, ansatz = Covariance(result.covariance(), None), result.ansatz
+        known, ansatz = result.errors or Covariance(result.covariance(), None), result.ansatz
         if pair is not None:
             images, pitch = ImageNoise.of(result.noise_sd), self.case.experiment.specimen.pitch
             known = covariance(result, pair, images, pitch, self.case.correlation.edge_px)
@@ -473,17 +493,13 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         solution = self.virtual.fem() if self.case.is_experiment else None
         is_compared = isinstance(self.case.mode, MeasuredMode) and solution
         return HomogenizationData(
-            found=found,
-            direct=Response(None, ()) if solution is None else direct_response(solution),
-            path={} if solution is None else solution.info["path"],
-            modes=modes,
-            parameters=parameters,
-            warnings=(*warnings, *not_reached(found["response"], len(self.case.loads))),
-            fields=fields,
-            measured=self.result if is_compared else None,
+            found=found, direct=Response(None, ()) if solution is None else
+            direct_response(solution), path={} if solution is None else solution.info["path"],
+            modes=modes, parameters=parameters, warnings=(*warnings, *not_reached(found["response"],
+            len(self.case.loads))), fields=fields, measured=self.result if is_compared else None,
             measured_strain=self._measured_strain,
             command=f"modeharvest homogenize {self.source} --out {self.folder}",
-        )
+        )  # fmt: skip
 
 
 def _own_states(body: HomogenizedBody, state: HomogenizedState) -> list[tuple[int, RVEState]]:

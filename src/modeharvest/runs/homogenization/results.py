@@ -181,7 +181,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
         "case": dict(case),
         "outcome": response["outcome"],
         "critical_strain": response["critical_strain"],
-        "critical_strain_sd": response["critical_strain_sd"],
+        **{k: response[k] for k in response if k.startswith("critical_strain_sd")},
         "criticals": found["criticals"],
         "branches": found["branches"],
         "first_order_critical_strain": found["first_order_critical_strain"],
@@ -191,6 +191,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
         "mode": to_plain({
             "kind": case["mode"]["kind"],
             "wave_change": [change for mode in modes for change in mode.wave_change],
+            "wave_deviation": known.deviations or None if known else None,
             "waves": [mode.snapped for mode in modes],
             "errors": known and ("noise" if known.by_model_error is None else "model error"),
         }) if modes else None,

@@ -45,11 +45,11 @@ from modeharvest.idic.photograph.plain import (
     plain_surface,
     write_holes,
 )
-from modeharvest.idic.result import Result
+from modeharvest.idic.result import Covariance, Result
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum
-from modeharvest.idic.uncertainty.covariance import Covariance, covariance, field_errors
+from modeharvest.idic.uncertainty.covariance import covariance, field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
@@ -225,7 +225,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             else:
                 measured, files = self._correlated_pair(name, last)
             write_field(field, measured.local)
-            measured.result.write(result)
+            replace(measured.result, errors=self._errors(name, measured)).write(result)
             whole = measured.whole and measured.whole.start
             return (result, field, *files), {"whole": whole, **picked(measured, "text warnings")}
 
@@ -314,14 +314,12 @@ class HarvestRun(StagedRun[PhotographCase]):
         pair, cell = self.prepared.pair(name), case.specimen.cell_size
         box = geometry.region.cellular
         x, y = _axes(geometry.region.domain)
-        noise, edge_px = image_noise(pair, self.prepared.noise), case.correlation.edge_px
-        if self._plain is not None and measured.whole:
-            found = Covariance(result.covariance(), measured.whole.refit.covariance())
-            test = ResidualTest(result.residual_correlation, result.pixels)
-        else:
-            found = covariance(result, pair, noise, cell, edge_px)
-            test = residual_test(result, pair, noise, edge_px)
-        by_model_error = found.by_model_error
+        test = ResidualTest(result.residual_correlation, result.pixels)
+        if self._plain is None or not measured.whole:
+            noise = image_noise(pair, self.prepared.noise)
+            test = residual_test(result, pair, noise, case.correlation.edge_px)
+        found = result.errors
+        assert found is not None
         along, across = mean_strain(result, box)
         spectrum = measured_spectrum(measured.local, cell, box)
         pattern = read_pattern(spectrum)
@@ -332,29 +330,24 @@ class HarvestRun(StagedRun[PhotographCase]):
             w = known.less(partial(result.ansatz.displacement_at, result.unknowns))
             own["w"] = measured_spectrum(w, cell, box)
         return HarvestedFrame(
-            name=name,
-            strain_x=along,
-            strain_y=across,
-            image=pair.deformed,
-            mask=pair.deformed_mask,
-            result=result,
-            identifiability=identifiability(result, pair.mask),
-            residual_test=test,
-            error_x=x,
-            error_y=y,
-            by_noise=field_errors(result, x, y, found.by_noise),
-            by_model_error=None
-            if by_model_error is None
-            else field_errors(result, x, y, by_model_error),
-            spectrum=spectrum,
-            pattern=pattern,
-            parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()),
-            w=w,
-            whole=measured.whole,
-            rigid=self.prepared.rigid.get(name),
-            start_text=tuple(s for s in measured.text if s not in pattern.text),
-            warnings=(*found.warnings, *measured.warnings),
-        )
+            name=name, strain_x=along, strain_y=across, image=pair.deformed,
+            mask=pair.deformed_mask, result=result, identifiability=identifiability(result,
+            pair.mask), residual_test=test, error_x=x, error_y=y, by_noise=field_errors(result, x,
+            y, found.by_noise), by_model_error=None if found.by_model_error is None else
+            field_errors(result, x, y, found.by_model_error), spectrum=spectrum, pattern=pattern,
+            parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()), w=w,
+            whole=measured.whole, rigid=self.prepared.rigid.get(name), start_text=tuple(s for s in
+            measured.text if s not in pattern.text), warnings=(*found.warnings, *measured.warnings),
+        )  # fmt: skip
+
+    def _errors(self, name: str, measured: MeasuredPhotograph) -> Covariance:
+        """Of a photograph's unknowns, by its noise and by model error."""
+        result, case = measured.result, self.case
+        if self._plain is not None and measured.whole:
+            return Covariance(result.covariance(), measured.whole.refit.covariance())
+        pair = self.prepared.pair(name)
+        noise, edge_px = image_noise(pair, self.prepared.noise), case.correlation.edge_px
+        return covariance(result, pair, noise, case.specimen.cell_size, edge_px)
 
     def _pair(self, name: str, last: tuple[str, MeasuredPhotograph] | None) -> ImagePair:
         """The photograph and what it is correlated with."""
