@@ -54,7 +54,10 @@ _GAUSS, _WEIGHTS = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6), np.array([5,
 _ROUGH_PX, _TOLERANCE_PX, _STEPS = 1.0, 0.01, 60
 _LEAST_DET = 0.02
 _PROBES = 4
-_ASTRAY = "The displacement from contours didn't converge: don't use it; give pictures in between."
+_ASTRAY = (
+    "The displacement from contours didn't converge: don't use it; give pictures in between, or of "
+    "more pixels across notches and slits."
+)
 _TRIANGULAR, _RECTANGULAR = 6.0, 3.0
 """Half-width squared over variance of such distributions: of what is most likely in the middle, and
 of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
