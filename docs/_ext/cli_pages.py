@@ -15,7 +15,9 @@ from sphinx.application import Sphinx
 def plain(text: str | None) -> str:
     """Help without the marks that make it bold, and safe in reStructuredText."""
     text = re.sub(r"\[/?bold\]", "", text or "")
-    return re.sub(r"([*_`|\\])", r"\\\1", text)
+    text = re.sub(r"([*_`|\\])", r"\\\1", text)
+    # Outside literals two dashes would become one.
+    return re.sub(r"(?<![\w-])(--[a-z]+(?:-[a-z]+)*(?:=\w+)?)", r"``\1``", text)
 
 
 def parameters(command: Any) -> Iterator[tuple[str, str, str]]:

@@ -68,11 +68,20 @@ def process(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: lis
         )
         if not paragraph and len(out) > 1 and out[-2:] == ["", ""]:
             out.pop()
-    # napoleon takes what stands before a colon in the first line for the type of an attribute.
-    lines[:] = ["", *out] if what in ("attribute", "data", "property") else out
+    lines[:] = out
+
+
+def restore(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: list[str]) -> None:
+    """Napoleon takes what stands before a colon for the type of an attribute: put it back."""
+    if what in ("attribute", "data", "property"):
+        for k, line in enumerate(lines):
+            if line.startswith(":type: "):
+                lines[:] = [f"{line.removeprefix(':type: ')}: {lines[0]}", *lines[1:k]]
+                return
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Before napoleon, whose priority is 500."""
+    """Before and after napoleon, whose priority is 500."""
     app.connect("autodoc-process-docstring", process, priority=400)
+    app.connect("autodoc-process-docstring", restore, priority=600)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

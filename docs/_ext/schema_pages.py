@@ -145,7 +145,8 @@ def kind_text(schema: dict[str, Any], command: str) -> str:
         return " or ".join(kind_text(option, command) for option in schema["anyOf"])
     kind = schema.get("type", "any")
     if kind == "array":
-        return f"list of {kind_text(schema['items'], command)}"
+        inner = kind_text(schema["items"], command)
+        return f"list of {inner}{'s' if inner.endswith('number') else ''}"
     kind = kind[0] if isinstance(kind, list) else kind
     names = {"string": "text", "integer": "whole number", "boolean": "true or false",
              "object": "table"}  # fmt: skip
