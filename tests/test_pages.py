@@ -29,8 +29,6 @@ DOCS = ROOT / "docs"
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not {"generated", "_build"} & set(p.parts))
 MOST_WORDS = 1200
 """Of a page without a figure."""
-NOT_YET = {"homogenization_studies"}
-"""Longer pages without a figure, to become shorter or to get one; this list may only shrink."""
 
 RUN_ELSEWHERE = {
     "bloch": "test_fem_bloch", "distortion": "test_distortion_page",
@@ -164,8 +162,7 @@ def test_no_page_is_long_without_a_figure() -> None:
         and words(page) > MOST_WORDS
         and not re.search(r"!\[|```\{figure\}", page.read_text("utf-8"))
     }  # fmt: skip
-    assert long - NOT_YET == set()
-    assert NOT_YET - long == set(), "shorter now, or with a figure: take them off the list"
+    assert long == set()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
