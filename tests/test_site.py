@@ -136,3 +136,10 @@ def test_no_equation_has_a_command_that_nothing_has_drawn(site: Path) -> None:
     for path in site.rglob("*.html"):
         for equation in re.findall(r"<math.*?</math>", path.read_text("utf-8"), re.DOTALL):
             assert not re.search(r">\\\w", equation), (path.name, equation)
+
+
+@pytest.mark.dolfinx
+def test_options_keep_both_dashes_and_attributes_their_texts(site: Path) -> None:
+    assert "–out" not in (site / "generated/command_line.html").read_text("utf-8")
+    text = (site / "generated/api/modeharvest.idic.html").read_text("utf-8")
+    assert "Of a slow field: 231 unknowns" in text
