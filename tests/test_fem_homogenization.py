@@ -534,6 +534,28 @@ def test_as_much_of_a_specimen_is_lattice_as_its_holes_cells_fill(stacking: str)
     assert specimen_mesh(Specimen(8, 5, bulk_x=0, bulk_y=0, stacking=stacking))[1].all()
 
 
+def test_a_lattice_s_extent_may_make_up_for_its_edges() -> None:
+    """Longer and higher by so much at each end, strips as wide as before, the load's length too."""
+    specimen, shifts = Specimen(4, 6), np.array([0.03, -0.02])
+    for quarter in (False, True):
+        mesh, is_lattice = specimen_mesh(specimen, (2, 3), quarter, shifts)
+        ends = mesh.nodes[np.unique(mesh.cells[is_lattice])].max(axis=0)
+        assert ends == pytest.approx(specimen.cellular_half_size + shifts)
+        assert mesh.nodes.max(axis=0) == pytest.approx(specimen.half_size + shifts)
+    first_order = RVE(square(PITCH, 1.5, 0.4), Ogden())
+    bodies = [
+        HomogenizedBody.of_specimen(
+            specimen, first_order, PlateLoading(quarter=True), edge_shifts=edge_shifts
+        )
+        for edge_shifts in ((0.0, 0.0), shifts)
+    ]
+    assert bodies[0].length == bodies[1].length == specimen.length
+    before, after = (homogenize(body, [0.01]).states[0].energy for body in bodies)
+    # A series and a sum of springs, nearly.
+    a, b = specimen.cellular_half_size
+    assert after / before == pytest.approx((1 - 0.03 / a) * (1 - 0.02 / b), abs=2e-3)
+
+
 def test_modes_that_will_not_do_are_refused() -> None:
     with pytest.raises(InputError, match="linearly independent"):
         RVE(cell(), Ogden(), [PATTERN, lambda X: -2.0 * PATTERN(X)], JUNCTION)

@@ -243,11 +243,10 @@ class ParameterEffect:
 
 
 def with_errors(
-    response: Response,
-    parameters: ModeParameters,
+    response: Response, parameters: ModeParameters,
     modes: Callable[[FloatArray], Sequence[LatticeMode]],
     predicted: Callable[[Sequence[LatticeMode]], Response],
-) -> tuple[Response, tuple[ParameterEffect, ...]]:
+) -> tuple[Response, tuple[ParameterEffect, ...]]:  # fmt: skip
     """Propagate the covariance of the modes' parameters to the response.
 
     response : with the parameters themselves.

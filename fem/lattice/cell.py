@@ -179,10 +179,11 @@ class LinearisedCell(CondensedCell):
         Q = self.loading.axes
         return CellState(
             load=self.load, gradient=(Q @ self.gradient).reshape(2, 2),
-            fluctuation=self.fluctuation, rate=np.concatenate([Q @ self.rate, self.response @
-            self.rate]), stress=np.asarray((Q @ self.macro_forces).reshape(2, 2) / self.area),
-            stiffness=self.stiffness, moduli=(Q @ self.condensed @ Q.T).reshape(2, 2, 2, 2) /
-            self.area,
+            fluctuation=self.fluctuation,
+            rate=np.concatenate([Q @ self.rate, self.response @ self.rate]),
+            stress=np.asarray((Q @ self.macro_forces).reshape(2, 2) / self.area),
+            stiffness=self.stiffness,
+            moduli=(Q @ self.condensed @ Q.T).reshape(2, 2, 2, 2) / self.area,
         )  # fmt: skip
 
 
@@ -235,8 +236,8 @@ class PeriodicCell:
         return found if isinstance(found, CellState) else None
 
     def corrected(
-        self, loading: MacroLoading, load: float, guess: FloatArray, amplitude: Amplitude | None =
-        None,
+        self, loading: MacroLoading, load: float, guess: FloatArray,
+        amplitude: Amplitude | None = None,
     ) -> CellState | str:  # fmt: skip
         """The equilibrium near a guess (4 + 2 count,) of F̄, w and, with an amplitude, the load.
 

@@ -169,8 +169,8 @@ class MatchedImages:
         return _sandwich(self.inverse_hessian, gradients)
 
     def noise_covariance(
-        self, examples: Iterable[tuple[FloatImage, FloatImage]], block: float, inverse: FloatArray |
-        None = None,
+        self, examples: Iterable[tuple[FloatImage, FloatImage]], block: float,
+        inverse: FloatArray | None = None,
     ) -> FloatArray:  # fmt: skip
         """(n, n) covariance of the unknowns by noise of any kind, from examples of it.
 
@@ -262,8 +262,8 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
     return FieldErrors(
         covariance=matrix, v0=propagated_sd(S[..., slow], matrix[slow, slow]),
         v=np.array(amplitude).reshape(len(modes), *shape),
-        fluctuation=np.array(pattern).reshape(len(modes), *shape, 2), displacement=propagated_sd(S,
-        matrix),
+        fluctuation=np.array(pattern).reshape(len(modes), *shape, 2),
+        displacement=propagated_sd(S, matrix),
     )  # fmt: skip
 
 

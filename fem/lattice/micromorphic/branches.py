@@ -57,8 +57,8 @@ class Homogenized:
 
 
 def homogenize(
-    body: HomogenizedBody, loads: Sequence[float], options: PathOptions | None = None, progress:
-    Progress = silent,
+    body: HomogenizedBody, loads: Sequence[float], options: PathOptions | None = None,
+    progress: Progress = silent,
 ) -> Homogenized:  # fmt: skip
     """States of a homogenized specimen at some loads [-], positive and ascending.
 
@@ -104,12 +104,9 @@ def homogenize(
 
 
 def follow_branch(
-    path: HomogenizedPath,
-    critical: HomogenizedCritical,
-    loads: Sequence[float],
-    pattern: Sequence[float] | None = None,
-    progress: Progress = silent,
-) -> tuple[list[HomogenizedState], str]:
+    path: HomogenizedPath, critical: HomogenizedCritical, loads: Sequence[float],
+    pattern: Sequence[float] | None = None, progress: Progress = silent,
+) -> tuple[list[HomogenizedState], str]:  # fmt: skip
     """States on a branch that starts at a critical point, and how it ended.
 
     One for each of the ``loads``, ascending, or fewer. Amplitudes are prescribed and grow;

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
@@ -60,9 +61,10 @@ class HomogenizedBody:
     """
 
     def __init__(
-        self, mesh: Mesh, rves: RVE | Sequence[RVE], loading: PlateLoading, length: float | None =
-        None, bulk: Material | None = None, is_lattice: BoolArray | None = None, points: int | None
-        = None, comm: MPI.Comm = MPI.COMM_WORLD, edges: Mapping[str, IntArray] | None = None,
+        self, mesh: Mesh, rves: RVE | Sequence[RVE], loading: PlateLoading,
+        length: float | None = None, bulk: Material | None = None,
+        is_lattice: BoolArray | None = None, points: int | None = None,
+        comm: MPI.Comm = MPI.COMM_WORLD, edges: Mapping[str, IntArray] | None = None,
     ) -> None:  # fmt: skip
         self.mesh, self.loading, self.bulk, self.comm = mesh, loading, bulk, comm
         self.rves = (rves,) if isinstance(rves, RVE) else tuple(rves)
@@ -97,12 +99,15 @@ class HomogenizedBody:
 
     @classmethod
     def of_specimen(
-        cls, specimen: Specimen, rves: RVE | Sequence[RVE], loading: PlateLoading, bulk: Material |
-        None = None, divisions: tuple[int, int] | None = None, points: int = 2, comm: MPI.Comm =
-        MPI.COMM_WORLD,
+        cls, specimen: Specimen, rves: RVE | Sequence[RVE], loading: PlateLoading,
+        bulk: Material | None = None, divisions: tuple[int, int] | None = None, points: int = 2,
+        comm: MPI.Comm = MPI.COMM_WORLD, edge_shifts: ArrayLike = (0.0, 0.0),
     ) -> HomogenizedBody:  # fmt: skip
-        """A rectangle of holes with its bulk edges, of the RVEs' material unless given."""
-        mesh, lattice = specimen_mesh(specimen, divisions, loading.quarter)
+        """A rectangle of holes with its bulk edges, of the RVEs' material unless given.
+
+        ``edge_shifts``: as ``specimen_mesh`` takes them.
+        """
+        mesh, lattice = specimen_mesh(specimen, divisions, loading.quarter, edge_shifts)
         solid = bulk or (rves if isinstance(rves, RVE) else rves[0]).material
         return cls(mesh, rves, loading, specimen.length, solid, lattice, points, comm)
 

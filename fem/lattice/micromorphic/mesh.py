@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -86,18 +87,21 @@ def rectangle_mesh(x: Sequence[float], y: Sequence[float]) -> Mesh:
 
 
 def specimen_mesh(
-    specimen: Specimen, divisions: tuple[int, int] | None = None, quarter: bool = False
-) -> tuple[Mesh, BoolArray]:
+    specimen: Specimen, divisions: tuple[int, int] | None = None, quarter: bool = False,
+    edge_shifts: ArrayLike = (0.0, 0.0),
+) -> tuple[Mesh, BoolArray]:  # fmt: skip
     """Q8 elements of a specimen, and which of them (m,) are lattice; the others are solid bulk.
 
     divisions : of the cellular part along x and y; by default one for two holes, at least two.
     quarter : only that with x, y >= 0, of half the divisions (rounded up).
+    edge_shifts : by how much the lattice is longer and higher at each of its ends [mm].
     """
-    whole, edges = specimen.half_size, np.array([specimen.bulk_x, specimen.bulk_y])
+    shifts, edges = np.asarray(edge_shifts), np.array([specimen.bulk_x, specimen.bulk_y])
+    whole = specimen.half_size + shifts
     # Next to solid edges of staggered rows as much is lattice as their holes' cells fill.
     cells = specimen.row_counts.mean(), specimen.holes_y
     filled = 0.5 * np.array(cells) * (specimen.pitch, specimen.row_distance)
-    half = np.where(edges > 0.0, filled, specimen.cellular_half_size)
+    half = np.where(edges > 0.0, filled, specimen.cellular_half_size) + shifts
     counts = divisions or [max(2, round(0.5 * n)) for n in (specimen.holes_x, specimen.holes_y)]
     if min(counts) < 1:
         raise InputError(f"macroscopic mesh: expected divisions of 1 or more, got {divisions}")

@@ -107,8 +107,8 @@ class HomogenizedPath:
         self.scale = np.abs(self._at_rest.diagonal())
 
     def equilibrium(
-        self, load: float, guess: FloatArray, weights: FloatArray | None = None, amplitude: float =
-        0.0, branch: str = "primary",
+        self, load: float, guess: FloatArray, weights: FloatArray | None = None,
+        amplitude: float = 0.0, branch: str = "primary",
     ) -> HomogenizedState | None:  # fmt: skip
         """The equilibrium near a guess at a load, or where weights . y = amplitude; or None."""
         value, count = guess, self.body.free_count
@@ -156,11 +156,12 @@ class HomogenizedPath:
         stresses = at.stresses + np.einsum("pst,pt->ps", at.moduli, strains[0] - at.strains)
         work_rate = body.direction @ (at.forces + (load - at.load) * at.along_load)
         return HomogenizedState(
-            load=float(load), force=body.copies * float(work_rate + at.load_force @ dy) /
-            body.length, energy=body.copies * energy, displacement=u, amplitudes=v,
-            strains=strains[0], stresses=stresses, negative_eigenvalues=at.negative,
-            rve_negative=at.rve_negative, pattern_negative=self._pattern_negative(at.stiffness),
-            value=value, rate=at.moved(at.along, 1.0, relax=False), branch=branch,
+            load=float(load),
+            force=body.copies * float(work_rate + at.load_force @ dy) / body.length,
+            energy=body.copies * energy, displacement=u, amplitudes=v, strains=strains[0],
+            stresses=stresses, negative_eigenvalues=at.negative, rve_negative=at.rve_negative,
+            pattern_negative=self._pattern_negative(at.stiffness), value=value,
+            rate=at.moved(at.along, 1.0, relax=False), branch=branch,
         )  # fmt: skip
 
     def _pattern_negative(self, stiffness: csr_array) -> int:

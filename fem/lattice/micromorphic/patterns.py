@@ -80,11 +80,9 @@ def rotation_pattern(pitch: float, pitch_y: float | None = None) -> PlaneWaves:
 
 
 def snapped(
-    mode: PlaneWaves,
-    lattice: ArrayLike,
-    about: ArrayLike = (0.0, 0.0),
+    mode: PlaneWaves, lattice: ArrayLike, about: ArrayLike = (0.0, 0.0),
     inversion_centre: ArrayLike | None = None,
-) -> PlaneWaves:
+) -> PlaneWaves:  # fmt: skip
     """The mode with the wave vectors nearest to its own that repeat on a cell.
 
     A percent of a wave number makes ten of the critical strain, so a measured mode needs this. An

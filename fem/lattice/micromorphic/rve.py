@@ -74,8 +74,8 @@ class RVE:
     """
 
     def __init__(
-        self, cell: UnitCell, material: Material, modes: Sequence[ModeField] = (), centre: ArrayLike
-        = (0.0, 0.0), normalisation: str = "rms",
+        self, cell: UnitCell, material: Material, modes: Sequence[ModeField] = (),
+        centre: ArrayLike = (0.0, 0.0), normalisation: str = "rms",
     ) -> None:  # fmt: skip
         if normalisation not in NORMALISATIONS:
             known = ", ".join(NORMALISATIONS)

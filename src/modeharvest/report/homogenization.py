@@ -38,9 +38,7 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
     table = ReportTable.of("homogenized-states", map(_state_row, _pairs(summary)))
     branches = ReportTable.of("homogenized-branches", map(_branch_row, summary["branches"]))
     return Report(
-        kind="homogenization",
-        title=summary["title"],
-        findings=findings(summary),
+        kind="homogenization", title=summary["title"], findings=findings(summary),
         keys=key_numbers(summary),
         sections=[
             Section.of("homogenized-response", _response_cards(data)),
@@ -56,11 +54,9 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
         ],
         notes=[text_of("homogenized-choices", **summary["case"]["homogenization"])],
         command=data.command if data else "",
-        case=summary["case"],
-        files=summary["files"],
+        case=summary["case"], files=summary["files"], versions=summary["versions"],
         costs={"RVEs": number(summary["rves"]),
                "linearisations of the specimen": number(summary["linearisations"])},
-        versions=summary["versions"],
         **caption("page-homogenization"),
     )  # fmt: skip
 

@@ -26,8 +26,8 @@ _ROOM = 0.24  # above and below a map [in]
 
 
 def draw_response(
-    path: Mapping[str, Any], critical: float | None, response: Mapping[str, Any], first_order: float
-    | None, key: str, label: str,
+    path: Mapping[str, Any], critical: float | None, response: Mapping[str, Any],
+    first_order: float | None, key: str, label: str,
 ) -> Figure:  # fmt: skip
     """Draw force or energy over nominal strain: direct simulation and homogenized states.
 

@@ -112,6 +112,9 @@ class HomogenizationOptions:
     mesh: str | None = None
     """A macroscopic mesh of one's own [mm] instead of the specimen, as ``read_body_mesh`` takes it;
     in a case file, relative to that file's folder."""
+    edge_shifts: tuple[float, float] = (0.0, 0.0)
+    """By how much a specimen's lattice is longer and higher at each end, which makes up for what
+    its edges have more or less energy than its inside [mm]; the page says how they are found."""
     first_order: bool = True
     """Whether to find the critical strain without modes, too."""
     error_bars: bool = True
@@ -121,6 +124,8 @@ class HomogenizationOptions:
         what = "homogenization: expected"
         require_within(f"{what} mesh_size", self.mesh_size, 0.0, above=True)
         require_within(f"{what} positions", self.positions, 1, 100)
+        for shift in self.edge_shifts:
+            require_within(f"{what} edge_shifts [mm]", shift, -1e3, 1e3)
         for number in self.divisions or ():
             require_within(f"{what} divisions", number, 1, 1000)
 

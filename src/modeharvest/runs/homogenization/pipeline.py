@@ -441,7 +441,9 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         rves = [RVE(cell, experiment.material, modes, c, normalisation="given") for c in centres]
         plates = self.case.plates
         if how.mesh is None:
-            return HomogenizedBody.of_specimen(specimen, rves, plates, divisions=how.divisions)
+            return HomogenizedBody.of_specimen(
+                specimen, rves, plates, divisions=how.divisions, edge_shifts=how.edge_shifts
+            )
         mesh, is_lattice, edges = read_body_mesh(how.mesh)
         if (extent := float(np.ptp(mesh.nodes, axis=0).min())) < specimen.pitch:
             what = f"a body of at least one cell, {specimen.pitch:g} mm"
@@ -493,10 +495,12 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         solution = self.virtual.fem() if self.case.is_experiment else None
         is_compared = isinstance(self.case.mode, MeasuredMode) and solution
         return HomogenizationData(
-            found=found, direct=Response(None, ()) if solution is None else
-            direct_response(solution), path={} if solution is None else solution.info["path"],
-            modes=modes, parameters=parameters, warnings=(*warnings, *not_reached(found["response"],
-            len(self.case.loads))), fields=fields, measured=self.result if is_compared else None,
+            found=found,
+            direct=Response(None, ()) if solution is None else direct_response(solution),
+            path={} if solution is None else solution.info["path"], modes=modes,
+            parameters=parameters,
+            warnings=(*warnings, *not_reached(found["response"], len(self.case.loads))),
+            fields=fields, measured=self.result if is_compared else None,
             measured_strain=self._measured_strain,
             command=f"modeharvest homogenize {self.source} --out {self.folder}",
         )  # fmt: skip

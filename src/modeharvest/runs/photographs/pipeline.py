@@ -331,13 +331,16 @@ class HarvestRun(StagedRun[PhotographCase]):
             own["w"] = measured_spectrum(w, cell, box)
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
-            mask=pair.deformed_mask, result=result, identifiability=identifiability(result,
-            pair.mask), residual_test=test, error_x=x, error_y=y, by_noise=field_errors(result, x,
-            y, found.by_noise), by_model_error=None if found.by_model_error is None else
-            field_errors(result, x, y, found.by_model_error), spectrum=spectrum, pattern=pattern,
+            mask=pair.deformed_mask, result=result,
+            identifiability=identifiability(result, pair.mask), residual_test=test, error_x=x,
+            error_y=y, by_noise=field_errors(result, x, y, found.by_noise),
+            by_model_error=None if found.by_model_error is None
+            else field_errors(result, x, y, found.by_model_error),
+            spectrum=spectrum, pattern=pattern,
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()), w=w,
-            whole=measured.whole, rigid=self.prepared.rigid.get(name), start_text=tuple(s for s in
-            measured.text if s not in pattern.text), warnings=(*found.warnings, *measured.warnings),
+            whole=measured.whole, rigid=self.prepared.rigid.get(name),
+            start_text=tuple(s for s in measured.text if s not in pattern.text),
+            warnings=(*found.warnings, *measured.warnings),
         )  # fmt: skip
 
     def _errors(self, name: str, measured: MeasuredPhotograph) -> Covariance:
