@@ -268,5 +268,5 @@ def test_compression_that_shows_is_noted(tmp_path: Path, size: float) -> None:
         Image.fromarray(levels).save(tmp_path / "a.jpg", quality=quality)
         stored = np.asarray(Image.open(tmp_path / "a.jpg"))[corner:, corner:]
         Image.fromarray(stored).save(tmp_path / "a.png")  # saved again, and cropped
-        notes = read_photograph(tmp_path / "a.png").notes
+        notes = read_photograph(tmp_path / "a.png").warnings
         assert any("blocks of 8 x 8 px" in note for note in notes) == (quality == 30)

@@ -314,7 +314,7 @@ def test_of_two_specimens_one_is_followed_and_the_other_one_named() -> None:
     reference = plain_surface(np.hstack([other, one]))
     assert reference is not None
     assert not reference.mask[:, :120].any()
-    (text,) = reference.text
+    (text,) = reference.warnings
     assert text.startswith("There are 2 specimens in the picture; the one of ")
     assert text.endswith("crop the pictures to measure another one.")
     grown = disks((132, 120), 8.25, CENTRES[[0, 2]], np.array([3.0, 3.0]), 0.0)  # the larger now

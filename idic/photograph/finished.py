@@ -45,7 +45,7 @@ class FinishedRun:
         if not paths:
             raise InputError(
                 "expected a folder of 'measure', or of whole displacements of 'harvest' or 'run', "
-                f"or one of their files (HDF5), got {place}"
+                f"or one of their files (HDF5), got {place}; 'harvest --whole-field' leaves them"
             )
         files, images = {path.stem: path for path in paths}, []
         if (record := place / "summary.json").is_file():

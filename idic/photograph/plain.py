@@ -84,7 +84,7 @@ class PlainSurface:
     holes."""
     noise: float
     """Variance of a contour's distance times the length over which it is correlated [px^3]."""
-    text: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """Whether there are other specimens in the picture."""
 
 

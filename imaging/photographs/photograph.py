@@ -59,6 +59,8 @@ class Photograph:
     off, or at 0."""
     notes: tuple[str, ...] = ()
     """Sentences about what was changed when it was read."""
+    warnings: tuple[str, ...] = ()
+    """Sentences about what makes errors larger."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -93,12 +95,10 @@ def read_photograph(path: Path | str) -> Photograph:
         notes.append("Colour was turned to grey: {} R + {} G + {} B.".format(*files.LUMA))
     if levels.dtype == np.uint16 and bits < 16:
         notes.append(f"Its 16-bit numbers fill {bits} bits.")
-    if shows_blocks(image):
-        notes.append(_MUSH)
-    stored_bits = 8 * levels.dtype.itemsize
     return Photograph(
-        Path(path), image, bits, stored_bits, full_scale, saturated, black, tuple(notes)
-    )
+        Path(path), image, bits, 8 * levels.dtype.itemsize, full_scale, saturated, black,
+        tuple(notes), (_MUSH,) * shows_blocks(image),
+    )  # fmt: skip
 
 
 def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tuple[str, ...]:

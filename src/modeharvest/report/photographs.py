@@ -83,6 +83,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
             Section.of("convergence", steps),
         ],
         warnings=[
+            *summary.get("warnings", []),
             *(f"not used: {row['name']}: {row['reason']}" for row in summary.get("skipped", [])),
             *(f"{frame['name']}: {_capitalised(warning)}" for frame in summary["frames"]
               for warning in frame["warnings"]),

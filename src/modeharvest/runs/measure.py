@@ -196,7 +196,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         given, options, image = self._given_mask, FiniteElementOptions(), self.reference.image
         blank: tuple[str, ...] = ()
         if self.plain is not None:
-            mask, blank = self.plain.mask, self.plain.text
+            mask, blank = self.plain.mask, self.plain.warnings
         else:
             mask, blank = speckled(image, find_material(image).mask if given is None else given)
         found = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
@@ -345,7 +345,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             else "found by its speckle" if self.plain is None
             else "found by its grey level",
             "notes": [*self.reference.notes, *(case.sequence.notes if case.sequence else ())],
-            "warnings": list(self.material.changes),
+            "warnings": [*self.reference.warnings, *self.material.changes],
             "skipped": [
                 {"name": name, "reason": reason} for name, reason in (
                     *(case.sequence.skipped if case.sequence else ()), *self._found[1].items())

@@ -160,20 +160,14 @@ class HarvestRun(StagedRun[PhotographCase]):
         case, prepared, region = self.case, self.prepared, self.geometry.region
         results, source = self.results(), Path(self.source)
         known = Harvest(
-            case,
-            self.geometry,
-            prepared.image(),
-            (),
-            prepared.noise,
-            skipped=(*prepared.skipped, *self.failures()),
-            optics=self.optics,
-            full_scale=prepared.full_scale,
-            text=(*prepared.notes, *region.text),
-            truth=truth,
+            case, self.geometry, prepared.image(), (), prepared.noise,
+            skipped=(*prepared.skipped, *self.failures()), optics=self.optics,
+            full_scale=prepared.full_scale, text=(*prepared.notes, *region.text),
+            warnings=prepared.warnings, truth=truth,
             command=f"modeharvest harvest {self.source} --out {self.folder}",
             toml=source.read_text("utf-8") if source.is_file() else "",
             versions=versions(*prepare.LIBRARIES),
-        )
+        )  # fmt: skip
         moments, numbers, kept = [], [], {}
         for name in counted(tuple(results), self.progress, "error bars"):
             frame = self._frame(name, results[name])

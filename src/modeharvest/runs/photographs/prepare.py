@@ -81,6 +81,8 @@ class PreparedPhotographs:
     """The camera's largest grey level."""
     notes: tuple[str, ...] = ()
     """What was done to the photographs."""
+    warnings: tuple[str, ...] = ()
+    """What makes their errors larger, and what else they show."""
     is_plain: bool = False
     """Whether they show no speckle: then their contours are measured."""
     rigid: Mapping[str, RigidMotion] = field(default_factory=dict)
@@ -273,6 +275,7 @@ def prepare(
     masks = of_each_photograph(case, table.deformed_material, "specimen.deformed_material")
     names, skipped = [], list(case.sequence.skipped if case.sequence else ())
     notes = [*reference.notes, *own.text, *(case.sequence.notes if case.sequence else ())]
+    warnings = [*own.warnings, *reference.warnings]
     for path in counted(deformed, progress, "prepare photographs"):
         try:
             frame = read_frame(path, reference)
@@ -289,6 +292,7 @@ def prepare(
             continue
         names.append(path.stem)
         notes += [note for note in frame.notes if note not in notes]
+        warnings += [text for text in frame.warnings if text not in warnings]
     if not names:
         raise InputError(
             f"expected a deformed image that can be used, got none of {len(deformed)}: "
@@ -297,7 +301,7 @@ def prepare(
     prepared = PreparedPhotographs(
         folder, tuple(names), tuple(skipped), _noise(case, reference, own.mask),
         PixelGrid.centred(*reference.shape, case.scale.mm_per_px), float(reference.full_scale),
-        tuple(notes), own.is_plain, rigid,
+        tuple(notes), tuple(warnings), own.is_plain, rigid,
     )  # fmt: skip
     content = to_plain(prepared)
     del content["folder"]
@@ -315,6 +319,8 @@ class ShownMaterial:
     """How it was found."""
     is_plain: bool = False
     """Whether the material has no speckle."""
+    warnings: tuple[str, ...] = ()
+    """Whether there are other specimens."""
 
 
 def _material(
@@ -328,7 +334,7 @@ def _material(
     where = like.mask if like else None
     plain = plain_surface(photograph.image, str(photograph.path), where)
     if plain is not None:
-        return ShownMaterial(plain.mask, (_PLAIN, *plain.text), True)
+        return ShownMaterial(plain.mask, (_PLAIN,), True, plain.warnings)
     found = find_material(photograph.image, window)
     return ShownMaterial(found.mask, found.text)
 
@@ -366,7 +372,7 @@ def _one_specimen(
         f"There are {number} specimens in the picture; the one of {sizes[chosen - 1]} px was "
         "measured: give a mask of another one as material."
     )
-    return replace(shown, mask=shown.mask & (parts == chosen), text=(*shown.text, text))
+    return replace(shown, mask=shown.mask & (parts == chosen), warnings=(text,))
 
 
 _LIGHT = 0.03

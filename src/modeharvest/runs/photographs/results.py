@@ -145,6 +145,8 @@ class Harvest:
     optics: Optics = field(default_factory=Optics)
     full_scale: float | None = None
     """Largest grey level of the camera; None if not known."""
+    warnings: tuple[str, ...] = ()
+    """What makes errors larger, and what else the photographs show."""
     text: tuple[str, ...] = ()
     """What was done to the photographs and found in them, in words."""
     truth: HarvestTruth | None = None
@@ -307,7 +309,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
         "lattice": _lattice(harvest.geometry.lattice) if harvest.geometry.lattice else None,
         "optics": harvest.optics.distortion and _optics(harvest, harvest.optics.distortion),
         "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
-        "text": harvest.text,
+        **picked(harvest, "text warnings"),
         "truth": [] if harvest.truth is None else harvest.truth.rows,
         "versions": harvest.versions,
     }
