@@ -84,6 +84,7 @@ class Structure:
             x = np.einsum("pa,mai->mpi", _AT_QUARTERS, mesh.nodes[mesh.cells]).reshape(-1, 2)
             cells = np.arange(len(x)).reshape(-1, 6)
             self.shown = join([MeshBlock(x, cells)], 1e-8 * float(np.ptp(x[:, 0])))
+            self._once = np.unique(self.shown.cells, return_index=True)[1]
         self.constants = self._forms.constants
         self.V, self._u = self._forms.V, self._forms.u
         self._direction, self._along = (dolfinx.fem.Function(self.V) for _ in range(2))
@@ -139,6 +140,8 @@ class Structure:
     def constrained(self, field: FloatArray) -> PETSc.Vec:
         """Vector with the constrained components of nodal values (n, 2) only; on one rank."""
         vector, fixed = self.zero(), self._fixed_owned
+        if not field.any():
+            return vector
         values, quadratic = (dolfinx.fem.Function(V) for V in (self.V, self._quadratic))
         quadratic.x.array[self._order] = field.ravel()
         values.interpolate(quadratic)
@@ -156,10 +159,8 @@ class Structure:
         """Nodal values (n, 2) at the nodes of ``shown``, quadratic between them."""
         if self._sampled is None:
             return field
-        found = np.empty_like(self.shown.nodes)
         values = np.einsum("pa,mai->mpi", _AT_QUARTERS, field[self.mesh.cells])
-        found[self.shown.cells] = values.reshape(-1, 6, 2)
-        return found
+        return np.asarray(values.reshape(-1, 2)[self._once])
 
     @cached_property
     def _order(self) -> IntArray:
@@ -183,9 +184,7 @@ class Structure:
         """(n, 2) displacement at the nodes of ``shown``, in their order [mm]; on every rank."""
         self._load(u)
         if self._sampled is not None:
-            found = np.empty_like(self.shown.nodes)
-            found[self.shown.cells] = self._sampled().reshape(-1, 6, 2)
-            return found
+            return np.asarray(self._sampled().reshape(-1, 2)[self._once])
         count = self.comm.bcast(len(self.mesh.nodes))
         return dolfinx_api.gather_nodes(self.V, self._u.x.array, count)
 
