@@ -46,7 +46,7 @@ SETS = {
 """True values [mm], and which parameters are unknown."""
 MESHES = {
     "holes": ((0.25, 3), (0.35, 3), (0.35, 4), 0.1),
-    "edges": ((0.2, 4), (0.35, 3), (0.25, 4), 0.06),
+    "edges": ((0.2, 4), (0.35, 3), (0.25, 4), 0.02),
 }
 """Size [mm] and degree of elements of the data, of the model and of its finer mesh, and the ratio
 of the errors of these two. With more, no states of such scattered holes are found at 12 %."""

@@ -34,10 +34,11 @@ from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.runs.identification.pipeline import error_ratio
 
 SPECIMEN = Specimen(4, 4, diameter=1.6, bulk_x=0.9, bulk_y=0.4)
 NOISE, FORCE_NOISE = 0.01, 0.005
-MESH, FINER, TWIN, ERROR_RATIO = 0.35, 0.25, 0.2, 0.06
+MESH, FINER, TWIN = 0.35, 0.25, 0.2
 UNKNOWNS = {
     "moduli[0]": Unknown(1.5, (0.1, 10.0)),
     "exponents[0]": Unknown(2.0, (0.5, 30.0)),
@@ -51,7 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--data", nargs="+", default=["Ogden", "I1"])
-    parser.add_argument("--strains", nargs="+", type=float, default=[0.06, 0.12])
+    parser.add_argument("--strains", nargs="+", type=float, default=[0.06, 0.11])
     parser.add_argument("--pixel-size", type=float, default=0.03, help="[mm/px]")
     parser.add_argument("--speckle", type=float, default=0.05, help="[cycles/px]")
     how = parser.parse_args()
@@ -102,7 +103,7 @@ def by_law(material: Material, how: argparse.Namespace) -> list[str]:
         result = identify(
             find, data, unknowns, pixel_size=px, levels=levels,
             forces=Readings(forces + rng.normal(0.0, sd, len(forces)), sd),
-            finer=FinerMesh(last, ERROR_RATIO), omitted=omitted,
+            finer=FinerMesh(last, error_ratio(FINER / MESH)), omitted=omitted,
             corrections=corrections(model.mesh.nodes, SPECIMEN.vectors),
         )  # fmt: skip
         tests = [getattr(result, name) for name in TESTS]

@@ -13,7 +13,7 @@ import pytest
 from summary_schemas import faults
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.field import Snapshot, Solution
+from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.materials import JetMatrix, Ogden, stress_and_tangent
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.local.field import LocalField, write_field
@@ -29,8 +29,10 @@ from modeharvest.runs.identification.case import IdentificationCase
 from modeharvest.runs.identification.pipeline import (
     IdentificationRun,
     _path_warnings,
+    _surface_warnings,
     run_identification,
 )
+from modeharvest.util.elements import reference_element
 from modeharvest.util.errors import InputError
 
 SPECIMEN = {"holes_x": 4, "holes_y": 2, "diameter": 1.5, "bulk_x": 0.9, "bulk_y": 0.4}
@@ -418,6 +420,18 @@ def test_images_of_another_number_are_refused(tmp_path: Path) -> None:
         case._base = tmp_path
         with pytest.raises(InputError, match=rf"as many {what} as strains \(2\), got 1"):
             run_identification(case, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("stretch", "is_beyond"), [(0.6, False), (0.5, True)])
+def test_states_beyond_the_surface_instability_are_warned_of(
+    stretch: float, is_beyond: bool
+) -> None:
+    nodes = reference_element("T6").nodes
+    u = nodes @ np.diag([0.2, stretch - 1.0])
+    state = SimpleNamespace(mesh=Mesh(nodes, np.arange(6)[None], "T6"), displacement=u, strain=0.12)
+    assert [f"At 12 % a stretch is {stretch:.3f}" in w for w in _surface_warnings(state)] == [
+        True
+    ] * is_beyond
 
 
 def test_states_that_are_not_those_of_the_whole_path_are_warned_of() -> None:
