@@ -1,7 +1,7 @@
 """Three DIC codes from PyPI, the whole displacement and micromorphic IDIC on a benchmark, scored.
 
 Run: benchmarks/score_codes/run [--specimen paper|plate] [--pixel-size 0.02] [--strain 0.128]
-     [--only CODE ...] [--standard DIR [--cases CASE ...]]
+     [--only CODE ...] [--standard DIR [--cases CASE ...] [--table]]
 
 Each code gets the public folder and nothing else: the 8-bit images, the mask, benchmark.json. Each
 returns a file, as anybody's would be, and 'modeharvest score' grades the files. All of it stays in
@@ -9,7 +9,7 @@ out/score_codes, with the report. The specimens: the paper's, with 60 holes, and
 
 --standard: instead, the cases of a set that 'modeharvest benchmark standard --out DIR' made, and
 their leaderboard; fields that are there already are kept, so it can be interrupted. With all codes
-and cases its table is written to docs/how-to/scoring.md.
+and cases its table is written to docs/how-to/scoring.md, with --table that of the fields there are.
 """
 
 from __future__ import annotations
@@ -203,7 +203,8 @@ OTHER_SPECIMENS = ("ligaments-thick", "ligaments-thin", "irregular", "plate")
 def standard(public: Path, arguments: argparse.Namespace) -> None:
     """Have every code measure the cases of a standard set; leaves a leaderboard."""
     handed_in, cases = OUT / "standard" / "codes", read_json(public / "summary.json")["cases"]
-    for case, code in product(arguments.cases or cases, arguments.only or CODES):
+    wanted = () if arguments.table else arguments.cases or cases
+    for case, code in product(wanted, arguments.only or CODES):
         field = handed_in / code / f"{case}.csv"
         if field.exists() or (CODES[code] in (idic, whole) and case in OTHER_SPECIMENS):
             continue
@@ -220,7 +221,7 @@ def standard(public: Path, arguments: argparse.Namespace) -> None:
     for row in board["codes"]:
         rms = {case: round(numbers["rms_px"], 4) for case, numbers in row["cases"].items()}
         print(f"{row['code']}: {row['rms_px']:.3g} px over {row['counted']} cases: {rms}")
-    if not (arguments.cases or arguments.only):
+    if arguments.table or not (arguments.cases or arguments.only):
         document.write(PAGE, {"standard": standard_table(board, cases)})
 
 
@@ -229,7 +230,7 @@ def standard_table(board: dict[str, Any], cases: dict[str, Any]) -> list[str]:
     rows = board["codes"]
     lines = [f"| rms [px], set {board['set']} | " + " | ".join(r["code"] for r in rows) + " |"]
     lines.append("|---" * (len(rows) + 1) + "|")
-    for case in cases:
+    for case in (c for c in cases if any(c in row["cases"] for row in rows)):
         cells = []
         for row in rows:
             found, missing = row["cases"].get(case), "failed"
@@ -247,7 +248,7 @@ def standard_table(board: dict[str, Any], cases: dict[str, Any]) -> list[str]:
 def main() -> None:
     arguments = _arguments()
     if arguments.standard is not None:
-        standard(arguments.standard, arguments)
+        standard(arguments.standard.resolve(), arguments)
         return
     case, is_plate = Case.read("paper-virtual"), arguments.specimen == "plate"
     imaging = replace(case.imaging, pixel_size=arguments.pixel_size)
@@ -289,6 +290,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=list(CODES), help="only these codes")
     parser.add_argument("--standard", type=Path, metavar="DIR", help="a standard set's folder")
     parser.add_argument("--cases", nargs="+", help="only these of the standard set")
+    parser.add_argument("--table", action="store_true", help="grade, measure nothing")
     parser.add_argument("--codes", required=True, help=argparse.SUPPRESS)
     return parser.parse_args()
 

@@ -364,7 +364,7 @@ def _amplitude_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[
          "v": f"{_micro(mode['v_max_mm'], 4)} ± {_two_errors(mode)}"}
         for frame in frames for i, mode in enumerate(frame["modes"], start=1)
     ]  # fmt: skip
-    return Card.tabular(ReportTable.of("amplitudes", rows), wide=len(frames) > 2)
+    return Card.tabular(ReportTable.of("amplitudes", rows), wide=len(frames) > 1)
 
 
 def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
@@ -385,7 +385,7 @@ def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
         caption = "± standard error by noise ± by model error." + (
             f" Fixed: {'; '.join(fixed)}." if fixed else "")  # fmt: skip
         cards += Card.tabular(table, caption=caption, paper="; ".join(families),
-                              wide=len(free) > 2)  # fmt: skip
+                              wide=len(free) > 1)  # fmt: skip
     return cards
 
 
@@ -411,7 +411,7 @@ def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]
                 rows.append({"photograph": names[frame["name"]] if i == w == 1 else "",
                              "wave": f"{w} of φ{i}{remark}", "xi1": xi1, "xi2": xi2})  # fmt: skip
     words = text_of("photographs-waves")
-    return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=len(frames) > 2)
+    return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=len(frames) > 1)
 
 
 def notes(summary: Summary) -> list[str]:
