@@ -233,7 +233,7 @@ def standard_table(board: dict[str, Any], cases: dict[str, Any]) -> list[str]:
     for case in (c for c in cases if any(c in row["cases"] for row in rows)):
         cells = []
         for row in rows:
-            found, missing = row["cases"].get(case), "failed"
+            found, missing = row["cases"].get(case), "none"
             if CODES[row["code"]] in (idic, whole) and case in OTHER_SPECIMENS:
                 missing = "–"
             share = 100 * found["covered"] if found else 100.0
@@ -242,7 +242,9 @@ def standard_table(board: dict[str, Any], cases: dict[str, Any]) -> list[str]:
         lines.append(f"| {case} | " + " | ".join(cells) + " |")
     lines.append("| cases that count | " + " | ".join(str(r["counted"]) for r in rows) + " |")
     means = " | ".join(f"{r['rms_px']:.2g}" for r in rows)
-    return [*lines, f"| geometric mean over them | {means} |"]
+    lines.append(f"| geometric mean over them | {means} |")
+    left = [case for case in cases if not any(case in row["cases"] for row in rows)]
+    return [*lines, "", f"Not measured yet: {', '.join(left)}."] if left else lines
 
 
 def main() -> None:
