@@ -408,7 +408,7 @@ def plates() -> None:
                   for h, (energy, force, _) in both))  # fmt: skip
 
 
-def edge_shifts(specimen: Specimen, rve: RVE, mesh_size: float) -> FloatArray:
+def edge_shifts(specimen: Specimen, rve: RVE, mesh_size: float, cells: int = 6) -> FloatArray:
     """(2,) by how much a lattice is longer and higher at each end, for its edges' energy [mm].
 
     Beside plates and sides, with the solid strips there, w isn't periodic, and the continuum's
@@ -417,8 +417,11 @@ def edge_shifts(specimen: Specimen, rve: RVE, mesh_size: float) -> FloatArray:
     and on one column with free sides. An extent of the lattice that makes up for it is the same for
     specimens of any size. ``rve`` has no modes; ``mesh_size``: of the direct simulation [mm].
     """
-    row = replace(specimen, holes_x=6, holes_y=1, bulk_y=0.0), PlateLoading(sides="guided")
-    column = (replace(specimen, holes_x=1, holes_y=6, bulk_x=0.0), PlateLoading(plates="sliding"))
+    row = replace(specimen, holes_x=cells, holes_y=1, bulk_y=0.0), PlateLoading(sides="guided")
+    column = (
+        replace(specimen, holes_x=1, holes_y=cells, bulk_x=0.0),
+        PlateLoading(plates="sliding"),
+    )
     shifts, by, own = np.zeros(2), 0.05 * specimen.pitch, MPI.COMM_SELF
     for axis, (part, loading) in enumerate((row, column)):
         mesh, (a, b) = mesh_specimen(part, mesh_size), part.half_size
@@ -439,8 +442,11 @@ def edge_shifts(specimen: Specimen, rve: RVE, mesh_size: float) -> FloatArray:
 
 def corrected() -> None:
     """Specimens whose lattice has the extent that makes up for its edges' energy."""
-    shifts = edge_shifts(Specimen(), RVE(square(PITCH, DIAMETER, SIZE), MATERIAL), SIZE)
-    print(f"\nLonger and higher at each end by {shifts.round(5)} mm.")
+    rve, bare = RVE(square(PITCH, DIAMETER, SIZE), MATERIAL), Specimen(bulk_x=0.0, bulk_y=0.0)
+    shifts = edge_shifts(Specimen(), rve, SIZE)
+    print(f"\nLonger and higher at each end by {shifts.round(5)} mm; of ten cells "
+          f"{edge_shifts(Specimen(), rve, SIZE, 10).round(5)}, without strips "
+          f"{edge_shifts(bare, rve, SIZE).round(5)}.")  # fmt: skip
     for size, strains in (((6, 10), (*STRAINS, 0.128)), ((12, 10), STRAINS)):
         specimen, name = Specimen(*size), f"{size[0]} x {size[1]}"
         direct = simulate(Experiment(specimen, strains=strains))
