@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from math import comb, factorial
 from typing import Any, cast
 
 import numpy as np
@@ -24,7 +25,7 @@ from numba import types as numba_types
 from numba.core import cgutils as numba_cgutils
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline, PPoly
+from scipy.interpolate import BSpline
 
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.compiled import compiled, in_parallel, readable
@@ -164,11 +165,12 @@ def lane_weights(order: int) -> FloatArray:
     pixels to the left of the one that t counts from.
     """
     taps = order + 1
-    pieces = PPoly.from_spline(BSpline.basis_element(np.arange(taps + 1.0)))
-    first = int(np.searchsorted(pieces.x, 0.0, side="right")) - 1
     found = np.zeros((taps, 1 << (taps - 1).bit_length()))
-    # Highest power first, and from the left end of the spline, where the last tap is.
-    found[:, :taps] = pieces.c[::-1, first : first + taps][:, ::-1]
+    # Exact, of whole numbers; the last tap is at the spline's left end.
+    for power, tap in np.ndindex(taps, taps):
+        left, rest = order - tap, order - power
+        terms = ((-1) ** k * comb(taps, k) * (left - k) ** rest for k in range(left + 1))
+        found[power, tap] = comb(order, power) * sum(terms) / factorial(order)
     return found
 
 
