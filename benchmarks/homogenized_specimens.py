@@ -352,8 +352,8 @@ def zones() -> None:
     loads, specimen = (0.04, 0.08, 0.1, 0.128), Specimen()
     direct = simulate(Experiment(specimen, strains=loads))
     at, exact = quadrature(direct.mesh, 3), []
-    for state in map(direct.at, loads):
-        H = np.einsum("cka,cpkb->cpab", state.displacement[direct.mesh.cells], at.gradients)
+    for snapshot in map(direct.at, loads):
+        H = np.einsum("cka,cpkb->cpab", snapshot.displacement[direct.mesh.cells], at.gradients)
         W = MATERIAL.energy(JetMatrix(np.eye(2) + H.reshape(-1, 2, 2))).value
         places = at.places.reshape(-1, 2)
         exact.append(energies_by_zone(specimen, places, at.weights.ravel() * W))
