@@ -225,6 +225,7 @@ class _Measurement:
         self.free: tuple[FloatArray, Deviations] | None = None
         self.contradicted: float | None = None
         self.edges: FreeEdges | None = None
+        self.by_edges: FloatArray = np.zeros_like(self.u)  # what they change, alike in all cells
         self.tried: tuple[Risk, ...] = ()
         self.warnings = body.changes
         images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
@@ -324,11 +325,11 @@ class _Measurement:
         left, right, bottom, top = self.pair.grid.extent
         off = _BORDER_PX * px
         edges = FreeEdges(self.body.mesh, (left + off, right - off, bottom + off, top - off))
-        noise = at.variance * self._noise_in(at)
-        edges.learn(at.u, uncertain(at, self.cutoff_px * px, noise))
+        edges.learn(at.u, uncertain(at, self.cutoff_px * px, at.variance * self._noise_in(at)))
         if edges.deviation:
             self.edges = edges
             self.through(_Stage(FULL, self.cutoff_px, _LAST_TOLERANCE_PX))
+            self.by_edges = self.u - at.u
 
     def _assessed(self) -> tuple[Linearised, Risk, Deviations]:
         """What there is at the present displacement."""
@@ -413,8 +414,7 @@ class _Measurement:
                 "expected images that determine a displacement, got no finite one: too much of "
                 "the mesh, or of the mask, shows no speckle that is in both images; check them"
             )
-        on = self._prepare(FULL)
-        counts = np.diff(on.pixels.start)
+        counts = np.diff(self._prepare(FULL).pixels.start)
         blank = float(counts[at.signal == 0.0].sum() / counts.sum())
         if blank > _BLANK:
             self.warnings += (
@@ -427,7 +427,7 @@ class _Measurement:
             standard_deviation=np.hypot(sd.by_noise, sd.bias),
             noise_deviation=sd.by_noise,
             gradient_covariance=sd.gradient,
-            roots=np.concatenate([sd.roots, self._without_edges(at)], axis=2),
+            roots=np.dstack([sd.roots, self.by_edges.reshape(-1, 2), self._without_edges(at)]),
             grid=self.pair.grid,
             residual_rms=at.sums.rms,
             residual_noise=here.noise,
