@@ -73,6 +73,8 @@ def test_the_reference_is_not_among_the_deformed(tmp_path: Path) -> None:
         tmp_path, "shots/f0.tif", ["shots"], FrameChoice(), LogTable(), tmp_path / "out"
     )
     assert [path.stem for path in found.deformed] == ["f1", "f2"]
+    with pytest.raises(InputError, match="besides the reference, got none"):
+        chosen(tmp_path, "shots/f0.tif")
 
 
 def test_an_empty_folder_is_one_line(tmp_path: Path) -> None:

@@ -257,8 +257,8 @@ def _chosen(
     left = left[:: choice.every]
     if not left:
         raise InputError(
-            f"images: expected photographs to measure, got none of {len(frames)}; check frames, "
-            "between_s and the names"
+            "images: expected photographs to measure besides the reference, got none of "
+            f"{len(frames)}; check their names, frames and between_s"
         )
     return tuple(left)
 
