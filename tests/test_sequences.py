@@ -69,12 +69,12 @@ def test_frame_2_comes_before_frame_10(tmp_path: Path) -> None:
 
 def test_the_reference_is_not_among_the_deformed(tmp_path: Path) -> None:
     folder_of(tmp_path / "shots", ["f0", "f1", "f2"])
-    found = chosen_frames(
-        tmp_path, "shots/f0.tif", ["shots"], FrameChoice(), LogTable(), tmp_path / "out"
-    )
+    how, log, out = FrameChoice(), LogTable(), tmp_path / "out"
+    found = chosen_frames(tmp_path, "shots/f0.tif", ["shots"], how, log, out)
     assert [path.stem for path in found.deformed] == ["f1", "f2"]
+    folder_of(tmp_path / "alone", ["f0"])
     with pytest.raises(InputError, match="besides the reference, got none"):
-        chosen(tmp_path, "shots/f0.tif")
+        chosen_frames(tmp_path, "alone/f0.tif", ["alone"], how, log, out)
 
 
 def test_an_empty_folder_is_one_line(tmp_path: Path) -> None:
