@@ -120,7 +120,7 @@ def test_intervals_of_strains(noisy: tuple[ImagePair, NodalResult]) -> None:
     slopes = [(wavy_field(nodes + s) - wavy_field(nodes - s)) / 2e-6 for s in steps]
     true = field_of("green_lagrange", np.eye(2) + np.stack(slopes, axis=-1))
     error, sd = result.field("green_lagrange") - true, result.field_deviation("green_lagrange")
-    # One seed; docs/explanation/whole_field.md has 30 of a specimen with holes.
+    # One seed; docs/explanation/whole_field_intervals.md has 30 of a specimen with holes.
     assert 0.9 < np.mean(abs(error) < 1.96 * sd) < 0.995
 
 

@@ -57,7 +57,7 @@ _FIRST_PX = 18.0
 _FIRST_WITH_LAW_PX = 150.0
 _WRONG = 0.075
 """Share of the edges' nodes that contradict a law beyond which it is said to be wrong; not 0.003,
-because smoothing takes more away at edges than bars know (docs/explanation/whole_field.md)."""
+because smoothing takes more away at edges than bars know (docs/explanation/whole_field_laws.md)."""
 _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
 _SHORT_PX = 0.1
