@@ -391,7 +391,8 @@ class _Measurement:
     def _without_edges(self, at: Linearised) -> FloatArray:
         """(n, 2, 1) change of u [mm] with twice as many rows of pixels left out at edges, or one.
 
-        By such changes show what images are wrong by there, and elements beyond their pixels.
+        By such changes show what images are wrong by there, and elements beyond their pixels. What
+        is known of edges would hide it: it is the change of what is measured without that.
         """
         on, body = self._prepare(FULL), self.body
         weight = at.weight(self.cutoff_px * self.pair.grid.pixel_size)
@@ -402,8 +403,9 @@ class _Measurement:
         left = normal_equations(pixels, body.mesh, on.images, at.u.reshape(-1, 2), on.continued)
         share = at.gain * at.signal[:, None, None]
         M = body.matrix(share[..., None] ** 2 * left.blocks)
-        others = replace(at, M=M, gradient=body.vector(share * left.gradient))
-        return others.factor(weight).solve(others.right(weight)).reshape(-1, 2, 1)
+        others = replace(at, M=M, gradient=body.vector(share * left.gradient), edges=None)
+        change = others.factor(weight).solve(others.right(weight)) + self.by_edges
+        return change.reshape(-1, 2, 1)
 
     def result(self) -> NodalResult:
         """Make the result, with its standard deviations."""
