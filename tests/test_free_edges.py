@@ -12,6 +12,7 @@ from scipy import ndimage
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
+from modeharvest.idic.finite_element.system import NodalPattern
 from modeharvest.idic.solver.free_edges import FreeEdges
 from modeharvest.imaging.pair import ImagePair
 
@@ -112,7 +113,8 @@ def test_departures_are_linearised(mesh: Mesh) -> None:
     u = kirsch(mesh.nodes).ravel()
     edges.learn(u, np.zeros((u.size, 1)))
     step = 1e-6 * random.standard_normal(u.size)
-    E, e = edges.linearised(u)
+    blocks, e = edges.linearised(u)
+    E = NodalPattern.of(len(mesh.nodes), mesh.cells).assembled(edges.nodes, blocks)
     # Gauss and Newton's matrix is that of the departures' squares where these are small.
     squares = [float(np.sum(edges._weighed(u + s * step)[1] ** 2)) for s in (1.0, -1.0)]
     assert e @ step == pytest.approx(-0.25 * (squares[0] - squares[1]), rel=1e-4)

@@ -283,9 +283,11 @@ class _Measurement:
             signal, gain = kept.signal, kept.gain
         gradient = body.vector(gain * signal[:, None, None] * sums.gradient)
         sums = replace(sums, blocks=blocks)
+        near = kept.known[0] if kept and kept.edges is self.edges else None
         self.kept = Linearised(
-            body, self.prior, self.u, sums, signal, gain, M, gradient, R, penalty, ratio, self.edges
-        )
+            body, self.prior, self.u, sums, signal, gain, M, gradient, R, penalty, ratio,
+            self.edges, near,
+        )  # fmt: skip
         return self.kept
 
     def through(self, stage: _Stage) -> None:

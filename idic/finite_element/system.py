@@ -70,15 +70,17 @@ class NodalPattern:
         return cls(joined.indptr.astype(np.int64), joined.indices.astype(np.int64))
 
     def assembled(self, nodes: IntArray, blocks: FloatArray) -> csr_array:
-        """(2 n, 2 n) sums of symmetric blocks (m, 3, k, k), xx, xy, yy, over their nodes (m, k)."""
-        parts = np.zeros((3, self.indices.size))
+        """(2 n, 2 n) sums over nodes (m, k) of blocks (m, 3 or 4, k, k).
+
+        Of xx, xy and yy, all symmetric, or of xx, xy, yx and yy.
+        """
+        parts = np.zeros((blocks.shape[1], self.indices.size))
         _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), parts)
         return self.matrix(parts)
 
     def matrix(self, parts: FloatArray) -> csr_array:
-        """(2 n, 2 n) of nodal parts xx, xy, yy (3, q)."""
-        xx, xy, yy = parts
-        blocks = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        """(2 n, 2 n) of nodal parts xx, xy, yy (3, q), or xx, xy, yx, yy (4, q)."""
+        blocks = np.stack([*parts[:2], *parts[-2:]], axis=1).reshape(-1, 2, 2)
         return bsr_array((blocks, self.indices, self.indptr)).tocsr()
 
 
@@ -341,6 +343,8 @@ class Linearised:
     """Of M to R, by the body's waves."""
     edges: FreeEdges | None = None
     """That are known beside the images, as well as the noise of their residual is."""
+    near: csr_array | None = None
+    """M and the matrix of what is known of edges, of another displacement close by."""
 
     def mean(self, values: FloatArray) -> float:
         """Mean over the pixels of values (m,) of the elements."""
@@ -360,8 +364,12 @@ class Linearised:
         """M and the gradient, with what is known of edges."""
         if self.edges is None:
             return self.M, self.gradient
-        E, e = self.edges.linearised(self.u)
-        return csr_array(self.M + self.variance * E), self.gradient + self.variance * e
+        blocks, e = self.edges.linearised(self.u)
+        A, M = self.near, self.M
+        if A is None:
+            E = self.body.pattern.assembled(self.edges.nodes, blocks)
+            A = csr_array((M.data + self.variance * E.data, M.indices, M.indptr), shape=M.shape)
+        return A, self.gradient + self.variance * e
 
     def factor(self, weight: float) -> Factor:
         """M + lambda R, factorised, and what is known of edges."""

@@ -115,13 +115,14 @@ class FreeEdges:
         # The two points of a side know the same.
         self._root = np.sqrt(0.5 / usual / (1.0 + unusual.mean(axis=2, keepdims=True)))
 
-    def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
-        """(2 n, 2 n) and (2 n,): sums of dd' and -dr of departures r of u, over their variance."""
+    def linearised(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sums of dd' and of -dr, (2 n,), of departures r of u, over their variance.
+
+        The first in blocks (s, 4, 6, 6) of xx, xy, yx and yy, over the ``nodes`` of each side.
+        """
         slopes, off = self._weighed(u)
-        rows, cols = np.repeat(self._dofs, 12, axis=1).ravel(), np.tile(self._dofs, 12).ravel()
-        blocks = slopes.swapaxes(1, 2) @ slopes
-        matrix = csr_array((blocks.ravel(), (rows, cols)), shape=(self.size, self.size))
-        return matrix, -self._sums(slopes, off[..., None])[:, 0]
+        blocks = (slopes.swapaxes(1, 2) @ slopes).reshape(-1, 6, 2, 6, 2).transpose(0, 2, 4, 1, 3)
+        return blocks.reshape(-1, 4, 6, 6), -self._sums(slopes, off[..., None])[:, 0]
 
     def samples(self, u: FloatArray, count: int) -> FloatArray:
         """(2 n, count) random vectors of what departures beyond errors of the learnt one do."""
