@@ -12,12 +12,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
-from modeharvest.util.arrays import FloatArray, IntArray
-from modeharvest.util.elements import reference_element, shape_gradients
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.elements import nodal_sums, reference_element, shape_gradients
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import nearest
 
@@ -189,10 +188,3 @@ def mean_around(mesh: Mesh, values: FloatArray) -> FloatArray:
     total = nodal_sums(n, mesh.cells, values.reshape(*mesh.cells.shape, -1))
     count = np.maximum(np.bincount(mesh.cells.ravel(), minlength=n), 1)
     return np.asarray((total / count[:, None]).reshape(n, *values.shape[2:]))
-
-
-def nodal_sums(count: int, nodes: IntArray, values: FloatArray) -> FloatArray:
-    """(count, s) sums of values (m, k, s) over the nodes (m, k) that they belong to."""
-    flat = nodes.ravel()
-    ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (count, flat.size))
-    return np.asarray(ones @ values.reshape(flat.size, values.shape[2]))

@@ -32,12 +32,12 @@ from scipy.sparse import bsr_array, csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
-from modeharvest.idic.finite_element.fields import mean_around, nodal_sums
+from modeharvest.idic.finite_element.fields import mean_around
 from modeharvest.idic.finite_element.pixels import MeshPixels, NodalEquations
 from modeharvest.idic.solver.free_edges import FreeEdges, on_sides
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
-from modeharvest.util.elements import reference_element, shape_gradients
+from modeharvest.util.elements import nodal_sums, reference_element, shape_gradients
 
 _PENALTY = 100.0
 """Of jumps of gradients across sides, against those of second gradients [-]."""
@@ -70,10 +70,7 @@ class NodalPattern:
         return cls(joined.indptr.astype(np.int64), joined.indices.astype(np.int64))
 
     def assembled(self, nodes: IntArray, blocks: FloatArray) -> csr_array:
-        """(2 n, 2 n) sums over nodes (m, k) of blocks (m, 3 or 4, k, k).
-
-        Of xx, xy and yy, all symmetric, or of xx, xy, yx and yy.
-        """
+        """(2 n, 2 n) sums over nodes (m, k) of blocks xx, xy, yy, or with yx, (m, 3 or 4, k, k)."""
         parts = np.zeros((blocks.shape[1], self.indices.size))
         _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), parts)
         return self.matrix(parts)
@@ -192,7 +189,7 @@ class Body:
         return self.pattern.assembled(self.mesh.cells, blocks)
 
     def vector(self, parts: FloatArray) -> FloatArray:
-        """(2 n,) of the parts (m, 6, 2) of the elements."""
+        """(2 n,) of the parts (m, 6, 2) of the elements, or (2 n count,) of (m, 6, 2 count)."""
         return nodal_sums(len(self.mesh.nodes), self.mesh.cells, parts).ravel()
 
     def energies(self, matrix: csr_array) -> float:
@@ -232,25 +229,21 @@ class Body:
         ``pull`` (m, 6, 2): what there is of them, of (m,) degrees of freedom. What is alike over an
         element, its own error first of all, pulls its nodes more than noise as large.
         """
-        m, cells = len(M), self.mesh.cells
-        M = _definite(M)
-        ridge = 1e-4 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(12)
-        moved = np.linalg.solve(M + ridge, pull.reshape(m, 12, 1))[..., 0]
+        m, own = len(M), _definite(M)
+        ridge = 1e-4 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(12)
+        moved = np.linalg.solve(own + ridge, pull.reshape(m, 12, 1))[..., 0]
         square = (pull.reshape(m, 12) * moved).sum(axis=1)
-        own = np.repeat(np.stack([square, free], axis=1)[:, None], 6, axis=1)
-        found, expected = mean_around(self.mesh, own).T
+        squares = np.repeat(np.stack([square, free], axis=1)[:, None], 6, axis=1)
+        found, expected = mean_around(self.mesh, squares).T
         inflation = np.maximum(found / np.maximum(expected, 1.0), 1.0)
-        M *= inflation[cells].mean(axis=1)[:, None, None]
-        return self._random(M, SAMPLES), inflation
+        share = inflation[self.mesh.cells].mean(axis=1)[:, None, None, None]
+        return self.random(share * M, SAMPLES), inflation
 
     def random(self, M: FloatArray, count: int) -> FloatArray:
         """(2 n, count) random vectors of the covariance M (m, 3, 6, 6)."""
-        return self._random(_definite(M), count)
-
-    def _random(self, M: FloatArray, count: int) -> FloatArray:
-        n, m = len(self.mesh.nodes), len(M)
-        z = np.linalg.cholesky(M) @ np.random.default_rng(0).standard_normal((m, 12, count))
-        return nodal_sums(n, self.mesh.cells, z.reshape(m, 6, -1)).reshape(2 * n, -1)
+        z = np.random.default_rng(0).standard_normal((len(M), 12, count))
+        z = np.linalg.cholesky(_definite(M)) @ z
+        return self.vector(z.reshape(len(M), 6, -1)).reshape(-1, count)
 
 
 def _definite(M: FloatArray) -> FloatArray:
@@ -293,9 +286,7 @@ class Imbalance:
         self.slopes = np.einsum("qkj,eqji->eqki", local, np.linalg.inv(F))
         self.weights = np.linalg.det(F) / 6.0
         self._free = csr_array(diags_array(np.repeat(~loaded, 2).astype(float)))
-        dofs = (2 * mesh.cells[:, :, None] + np.arange(2)).reshape(len(mesh.cells), 12)
-        self._rows, self._cols = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, 12).ravel()
-        self._dofs = dofs.ravel()
+        self._pattern = NodalPattern.of(len(mesh.nodes), mesh.cells)
 
     def forces(self, u: FloatArray) -> tuple[FloatArray, csr_array]:
         """(2 n,) internal forces at u (2 n,) and their derivatives (2 n, 2 n), up to a factor."""
@@ -306,11 +297,11 @@ class Imbalance:
         P, A = stress_and_tangent(self.material, F.reshape(-1, 2, 2))
         w = (self.weights * there)[..., None, None]
         P, A = P.reshape(F.shape) * w, A.reshape(*F.shape, 2, 2) * w[..., None, None]
-        f = np.einsum("eqij,eqaj->eai", P, self.slopes, optimize=True)
+        parts = np.einsum("eqij,eqaj->eai", P, self.slopes, optimize=True)
         half = np.einsum("eqijkl,eqbl->eqijkb", A, self.slopes, optimize=True)
-        K = np.einsum("eqijkb,eqaj->eaibk", half, self.slopes, optimize=True)
-        total = np.asarray(np.bincount(self._dofs, f.ravel(), u.size), dtype=np.float64)
-        return total, csr_array((K.ravel(), (self._rows, self._cols)), shape=(u.size, u.size))
+        K = np.einsum("eqijkb,eqaj->eikab", half, self.slopes, optimize=True)
+        f = nodal_sums(len(self.mesh.nodes), cells, parts).ravel()
+        return f, self._pattern.assembled(cells, K.reshape(-1, 4, 6, 6))
 
     def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
         """(2 n, 2 n) K'DK and (2 n,) K'Df."""

@@ -16,11 +16,15 @@ usual nor an error of what was measured is known less well, by a fifth of its de
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.util.arrays import FloatArray, IntArray
-from modeharvest.util.elements import reference_element, shape_functions, shape_gradients
+from modeharvest.util.elements import (
+    nodal_sums,
+    reference_element,
+    shape_functions,
+    shape_gradients,
+)
 
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
 """Along a side, from 0 to 1."""
@@ -79,8 +83,7 @@ class FreeEdges:
         """(2, s, g, 2) T and N at points of each side."""
         self.slopes = np.einsum("sgki,fsgi->fsgk", slopes[there], self.frame)
         """(2, s, g, k) of the shape functions along T and N [1/mm]."""
-        self.nodes, self.size = mesh.cells[cell[there]], 2 * len(mesh.nodes)
-        self._dofs = (2 * self.nodes[:, :, None] + np.arange(2)).reshape(-1, 12)
+        self.nodes, self._count = mesh.cells[cell[there]], len(mesh.nodes)
 
     def _turned(self, u: FloatArray) -> tuple[FloatArray, ...]:
         """(s, g) l; (s, g, 2) FT/l and n; (s, g) FN along n and along FT."""
@@ -99,7 +102,8 @@ class FreeEdges:
             return
         length, _, _, normal, _ = self._turned(u)
         x, y = np.log(length), np.log(np.maximum(normal, _LEAST))
-        weight, errors = np.ones_like(x), uncertain[self._dofs]
+        weight, of_nodes = np.ones_like(x), uncertain.reshape(self._count, 2, -1)
+        errors = of_nodes[self.nodes].reshape(len(self.nodes), 12, -1)
         for _ in range(_ROUNDS):
             self.exponent = -float((weight * x * y).sum() / max((weight * x**2).sum(), _LEAST**2))
             slopes, off = self._departures(u)
@@ -150,9 +154,5 @@ class FreeEdges:
 
     def _sums(self, slopes: FloatArray, values: FloatArray) -> FloatArray:
         """(2 n, c) sums over all sides of their derivatives times values (s, 2 g, c)."""
-        parts = slopes.swapaxes(1, 2) @ values
-        ones = csr_array(
-            (np.ones(self._dofs.size), (self._dofs.ravel(), np.arange(self._dofs.size))),
-            shape=(self.size, self._dofs.size),
-        )
-        return np.asarray(ones @ parts.reshape(self._dofs.size, -1))
+        parts = (slopes.swapaxes(1, 2) @ values).reshape(*self.nodes.shape, -1)
+        return nodal_sums(self._count, self.nodes, parts).reshape(2 * self._count, -1)

@@ -1,4 +1,4 @@
-"""Reference elements T3, T6, Q4, Q8 and Q9: nodes, shape functions, polynomials over them.
+"""Reference elements T3, T6, Q4, Q8 and Q9: nodes, shape functions, polynomials; sums over nodes.
 
 An element is its nodes and the monomials it spans; everything else follows. Over an element
 every field (position, displacement) is one polynomial in the local coordinates (xi, eta), kept
@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
 
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
@@ -104,3 +105,10 @@ def polynomials(name: str, cells: IntArray, nodal: FloatArray) -> FloatArray:
     per_cell = np.ascontiguousarray(nodal[cells].transpose(0, 2, 1), dtype=np.float64)
     flat = per_cell.reshape(-1, cells.shape[1]) @ reference_element(name).coefficients.T
     return flat.reshape(len(cells), nodal.shape[1], 9)
+
+
+def nodal_sums(count: int, nodes: IntArray, values: FloatArray) -> FloatArray:
+    """(count, s) sums of values (m, k, s) over the nodes (m, k) that they belong to."""
+    flat = nodes.ravel()
+    ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (count, flat.size))
+    return np.asarray(ones @ values.reshape(flat.size, values.shape[2]))
