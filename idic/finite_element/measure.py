@@ -283,11 +283,9 @@ class _Measurement:
             signal, gain = kept.signal, kept.gain
         gradient = body.vector(gain * signal[:, None, None] * sums.gradient)
         sums = replace(sums, blocks=blocks)
-        near = kept.known[0] if kept and kept.edges is self.edges else None
-        self.kept = Linearised(
-            body, self.prior, self.u, sums, signal, gain, M, gradient, R, penalty, ratio,
-            self.edges, near,
-        )  # fmt: skip
+        known = self.edges, kept.known[0] if kept and kept.edges is self.edges else None
+        found = body, self.prior, self.u, sums, signal, gain, M, gradient, R, penalty, ratio
+        self.kept = Linearised(*found, *known)
         return self.kept
 
     def through(self, stage: _Stage) -> None:
@@ -398,8 +396,7 @@ class _Measurement:
         """
         on, body = self._prepare(FULL), self.body
         weight = at.weight(self.cutoff_px * self.pair.grid.pixel_size)
-        inner = eroded(on.images.mask, max(1, self.options.edge_px))
-        keep = inner[on.pixels.row, on.pixels.col]
+        keep = eroded(on.images.mask, max(1, self.options.edge_px))[on.pixels.row, on.pixels.col]
         start = np.concatenate([[0], np.cumsum(keep)])[on.pixels.start]
         pixels = ElementPixels(start, *(part[..., keep] for part in on.pixels[1:]))
         left = normal_equations(pixels, body.mesh, on.images, at.u.reshape(-1, 2), on.continued)

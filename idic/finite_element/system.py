@@ -250,8 +250,7 @@ def _definite(M: FloatArray) -> FloatArray:
     """(m, 12, 12) blocks (m, 3, 6, 6) of elements, of which those with few pixels are singular."""
     M = M[:, [[0, 1], [1, 2]]].transpose(0, 3, 1, 4, 2).reshape(len(M), 12, 12)
     M[:, range(12), range(12)] *= 1.0 + 1e-9
-    M[:, range(12), range(12)] += max(1e-12 * M.max(), _TINY)
-    return M
+    return np.asarray(M + max(1e-12 * M.max(), _TINY) * np.eye(12))
 
 
 class Smoothness:
