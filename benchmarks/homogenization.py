@@ -40,10 +40,9 @@ from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.micromorphic.body import PlateLoading, rectangle_mesh
 from modeharvest.fem.lattice.micromorphic.branches import homogenize
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
-from modeharvest.fem.lattice.micromorphic.mesh import rectangle_mesh
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.patterns import ModeField, rotation_pattern
 from modeharvest.fem.lattice.micromorphic.rve import RVE, spread_positions
 from modeharvest.fem.lattice.options import (

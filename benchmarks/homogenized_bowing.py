@@ -38,10 +38,10 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.experiment import PathOptions
+from modeharvest.fem.lattice.micromorphic.body import PlateLoading
 from modeharvest.fem.lattice.micromorphic.branches import follow_branch as follow_homogenized
 from modeharvest.fem.lattice.micromorphic.branches import homogenize
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.path import HomogenizedPath
 from modeharvest.fem.lattice.micromorphic.rve import RVE
 from modeharvest.fem.meshing import mesh_specimen

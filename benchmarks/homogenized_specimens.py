@@ -28,7 +28,6 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -58,11 +57,11 @@ from mpi4py import MPI
 
 from modeharvest.fem.experiment import Experiment, PathOptions
 from modeharvest.fem.field import Mesh, Solution
-from modeharvest.fem.lattice.cells import hexagonal, square
+from modeharvest.fem.lattice.cells import hexagonal
+from modeharvest.fem.lattice.micromorphic.body import PlateLoading, quadrature
 from modeharvest.fem.lattice.micromorphic.branches import Homogenized, homogenize
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, LinearisedBody
-from modeharvest.fem.lattice.micromorphic.mesh import quadrature
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading
+from modeharvest.fem.lattice.micromorphic.edges import edge_shifts
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves
 from modeharvest.fem.lattice.micromorphic.rve import RVE
 from modeharvest.fem.materials import JetMatrix
@@ -92,7 +91,7 @@ def homogenized_specimen(
     size: tuple[int, int],
     divisions: tuple[int, int],
     loads: tuple[float, ...],
-    points: int = 2,
+    points: int | None = None,
     **options: Any,
 ) -> tuple[Homogenized, HomogenizedBody, float]:
     """What is found, of what, and in how many seconds."""
@@ -408,45 +407,15 @@ def plates() -> None:
                   for h, (energy, force, _) in both))  # fmt: skip
 
 
-def edge_shifts(specimen: Specimen, rve: RVE, mesh_size: float, cells: int = 6) -> FloatArray:
-    """(2,) by how much a lattice is longer and higher at each end, for its edges' energy [mm].
-
-    Beside plates and sides, with the solid strips there, w isn't periodic, and the continuum's
-    energy is off by so much a row or column of cells. That is a matter of material and cell alone:
-    it is found, at small strains, on one row of cells between plates, whose sides stay straight,
-    and on one column with free sides. An extent of the lattice that makes up for it is the same for
-    specimens of any size. ``rve`` has no modes; ``mesh_size``: of the direct simulation [mm].
-    """
-    row = replace(specimen, holes_x=cells, holes_y=1, bulk_y=0.0), PlateLoading(sides="guided")
-    column = (
-        replace(specimen, holes_x=1, holes_y=cells, bulk_x=0.0),
-        PlateLoading(plates="sliding"),
-    )
-    shifts, by, own = np.zeros(2), 0.05 * specimen.pitch, MPI.COMM_SELF
-    for axis, (part, loading) in enumerate((row, column)):
-        mesh, (a, b) = mesh_specimen(part, mesh_size), part.half_size
-        sides = mesh.nodes[np.abs(np.abs(mesh.nodes[:, 1]) - b) < 1e-6 * b]
-        pins = tuple((float(x), float(y)) for x, y in sides) if axis == 0 else ()
-        plates = EdgeCompression(a, part.length, loading.plates, pins=pins)
-        follower = PathFollower(Structure(mesh, rve.material, plates, own), PathOptions())
-        path = [follower.start()]
-        follower.follow_primary(path, (1e-3,))
-        energies = [follower.structure.energy(path[-1].u)]
-        for moved in by * np.array([-np.eye(2)[axis], np.eye(2)[axis]]):
-            body = HomogenizedBody.of_specimen(part, rve, loading, comm=own, edge_shifts=moved)
-            energies.append(homogenize(body, [1e-3]).states[0].energy)
-        exact, least, most = energies
-        shifts[axis] = by * (2.0 * (exact - least) / (most - least) - 1.0)
-    return shifts
-
-
 def corrected() -> None:
     """Specimens whose lattice has the extent that makes up for its edges' energy."""
-    rve, bare = RVE(square(PITCH, DIAMETER, SIZE), MATERIAL), Specimen(bulk_x=0.0, bulk_y=0.0)
-    shifts = edge_shifts(Specimen(), rve, SIZE)
-    print(f"\nLonger and higher at each end by {shifts.round(5)} mm; of ten cells "
-          f"{edge_shifts(Specimen(), rve, SIZE, 10).round(5)}, without strips "
-          f"{edge_shifts(bare, rve, SIZE).round(5)}.")  # fmt: skip
+    bare, loading = Specimen(bulk_x=0.0, bulk_y=0.0), PlateLoading(quarter=True)
+    start = time.process_time()
+    shifts = edge_shifts(Specimen(), MATERIAL, SIZE, loading)
+    seconds = time.process_time() - start
+    without = edge_shifts(bare, MATERIAL, SIZE, loading)
+    print(f"\nLonger and higher at each end by {np.round(shifts, 5)} mm, found in {seconds:.2f} s; "
+          f"without strips {np.round(without, 5)} mm.")  # fmt: skip
     for size, strains in (((6, 10), (*STRAINS, 0.128)), ((12, 10), STRAINS)):
         specimen, name = Specimen(*size), f"{size[0]} x {size[1]}"
         direct = simulate(Experiment(specimen, strains=strains))
@@ -455,9 +424,8 @@ def corrected() -> None:
         head(name, "RVEs", "ε_c", *at, "negative eigenvalues")
         for count in (1, 5):
             body = HomogenizedBody.of_specimen(
-                specimen, spread(count), PlateLoading(quarter=True),
-                divisions=PARTS[size], edge_shifts=shifts,
-            )  # fmt: skip
+                specimen, spread(count), loading, divisions=PARTS[size], edge_shifts=shifts
+            )
             found = homogenize(body, strains)
             e = found.critical.load if found.critical else np.nan
             both = zip(found.states, states, strict=True)
@@ -575,9 +543,16 @@ def bent() -> None:
     exact_states = states_of(direct, strains)
     title = "6 x 10, one plate turned by 1 rad a unit of strain"
     direct_row(title, strains, exact_states, time.perf_counter() - start)
-    for parts in ((3, 5), (6, 10)):
-        body = HomogenizedBody.of_specimen(Specimen(), analytic(), PlateLoading(), divisions=parts)
-        homogenized_row("homogenized", body, strains, exact_states, shortening=tilted(body, 1.0))
+    shifts = edge_shifts(Specimen(), MATERIAL, SIZE, PlateLoading())
+    none = (0.0, 0.0)
+    for name, parts, moved in (
+        ("homogenized", (3, 5), none), ("homogenized", (6, 10), none),
+        ("with edge shifts", (3, 5), shifts),
+    ):  # fmt: skip
+        body = HomogenizedBody.of_specimen(
+            Specimen(), analytic(), PlateLoading(), divisions=parts, edge_shifts=moved
+        )
+        homogenized_row(name, body, strains, exact_states, shortening=tilted(body, 1.0))
     sheared()
 
 

@@ -39,9 +39,9 @@ from whole_field import noisy
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.lattice.cells import UnitCell, square
+from modeharvest.fem.lattice.micromorphic.body import PlateLoading
 from modeharvest.fem.lattice.micromorphic.branches import homogenize
 from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading
 from modeharvest.fem.lattice.micromorphic.patterns import PlaneWaves, snapped
 from modeharvest.fem.lattice.micromorphic.rve import RVE
 from modeharvest.fem.specimen import Specimen

@@ -6,32 +6,14 @@ matrices of a pattern. Without it SciPy's SuperLU does the work, in several time
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_matrix, csr_array
 from scipy.sparse.linalg import splu
 
 from modeharvest.util.arrays import FloatArray
-
-
-class Factor(Protocol):
-    """A factorised matrix."""
-
-    library: str
-    """What factorised it."""
-
-    def update(self, matrix: csr_array) -> None:
-        """Factorise another matrix of the same pattern."""
-
-    def solve(self, rhs: FloatArray) -> FloatArray:
-        """Solve for one right-hand side (n,) or for several (n, k)."""
-
-    @property
-    def negative_pivots(self) -> int:
-        """Number of negative eigenvalues, by Sylvester's law of inertia."""
 
 
 def factorise(matrix: csr_array, library: str | None = None, definite: bool = True) -> Factor:
@@ -129,4 +111,8 @@ def negative_pivots(factor: Any) -> int:
     return int(np.count_nonzero(factor.U.diagonal().real < 0))
 
 
-LIBRARIES: dict[str, Callable[[csr_array, bool], Factor]] = {"mumps": _Mumps, "superlu": _SuperLU}
+Factor = _Mumps | _SuperLU
+"""A factorised matrix, and in ``library`` what factorised it. ``update`` takes another one of the
+same pattern, ``solve`` a right-hand side (n,) or several (n, k); ``negative_pivots`` counts
+negative eigenvalues, by Sylvester's law of inertia."""
+LIBRARIES: dict[str, type[Factor]] = {"mumps": _Mumps, "superlu": _SuperLU}

@@ -95,6 +95,8 @@ def test_a_pattern_and_its_mirror_image_are_one() -> None:
         ({"homogenization": {"centre": "ligament"}}, "centre"),
         ({"homogenization": {"centre": [1e9, 0.0]}}, r"a centre \[mm\] of -3.8 to 3.8, got 1"),
         ({"homogenization": {"quater": True}}, "did you mean 'quarter'"),
+        ({"homogenization": {"mesh": "b.msh", "edge_shifts": [0.1, 0.0]}}, "not of a mesh"),
+        ({"homogenization": {"edge_shifts": "guess"}}, "edge_shifts"),
     ],
 )
 def test_what_can_not_be_homogenized_is_refused(
@@ -170,6 +172,8 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
     assert {s["negative_eigenvalues"] for s in summary["states"]} == {0}
     require_exported(out, summary)
     assert faults(summary, "homogenize") == []
+    assert summary["edge_shifts"]["source"] == "found"
+    assert summary["edge_shifts"]["mm"][0] > 0 > summary["edge_shifts"]["mm"][1]
     # The same mode from its file: without the images it was measured in, and their strain.
     result = out / "experiment/correlation/result_1300.json"
     one = SMALL.replace('"measured"', f'"file"\nsnap_anyway = true\npath = "{result}"')

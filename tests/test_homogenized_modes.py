@@ -18,6 +18,7 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.util.errors import InputError
 from modeharvest.validation.homogenization import (
     LatticeMode,
+    MeasuredModes,
     ModeParameters,
     Response,
     StateNumbers,
@@ -127,9 +128,8 @@ def parameters(linear: Linear, sd: float) -> ModeParameters:
 def test_error_bars_are_propagated_by_differences() -> None:
     linear = Linear()
     response = linear.response(linear.snapped(linear.start))
-    found, effects = with_errors(
-        response, parameters(linear, 0.02), linear.snapped, linear.response
-    )
+    measured = MeasuredModes(parameters(linear, 0.02), linear.snapped)
+    found, effects = with_errors(response, measured, linear.response)
     assert linear.calls == 2, "one run for a1; the lattice says the other six"
     assert found.critical_strain_sd == pytest.approx(0.01 * 0.02)
     assert [s.force_sd_N_per_mm for s in found.states] == pytest.approx([2 * 0.02, 4 * 0.02])
@@ -143,7 +143,8 @@ def test_without_images_error_bars_are_those_of_noise() -> None:
     linear = Linear()
     response = linear.response(linear.snapped(linear.start))
     errors = replace(parameters(linear, 0.02), by_model_error=None)
-    found, effects = with_errors(response, errors, linear.snapped, linear.response)
+    measured = MeasuredModes(errors, linear.snapped)
+    found, effects = with_errors(response, measured, linear.response)
     assert found.critical_strain_sd == pytest.approx(0.01 * 1e-4)
     assert effects[0].sd_model_error is None
 
@@ -151,9 +152,8 @@ def test_without_images_error_bars_are_those_of_noise() -> None:
 def test_a_state_that_a_changed_mode_does_not_reach_has_no_error_bar() -> None:
     linear = Linear(reached=1)
     response = linear.response(linear.snapped(linear.start))
-    found, effects = with_errors(
-        response, parameters(linear, 0.02), linear.snapped, linear.response
-    )
+    measured = MeasuredModes(parameters(linear, 0.02), linear.snapped)
+    found, effects = with_errors(response, measured, linear.response)
     assert found.states[0].force_sd_N_per_mm == pytest.approx(0.04)
     assert found.states[1].force_sd_N_per_mm is None
     assert effects[0].energy[1] is None

@@ -123,7 +123,10 @@ class LatticeMode:
     ) -> LatticeMode:
         """Of waves in the lattice's coordinates, whose phases are kept at a point; as ``of``."""
         mode_found = cls(found, snapped(found, vectors, about, inversion_centre=(0.0, 0.0)))
-        if not (overlap := mode_found.overlap(snapped(found, vectors, about))) >= _LEAST_OVERLAP:
+        as_found = snapped(found, vectors, about)
+        a, b = (np.stack([w.cosine, w.sine]).ravel() for w in (mode_found.snapped, as_found))
+        overlap = a @ b / (np.linalg.norm(a) * np.linalg.norm(b))
+        if not overlap >= _LEAST_OVERLAP:
             raise InputError(
                 "mode: expected phases of the lattice, its holes at points of symmetry, got a "
                 f"pattern of which snapping them leaves {100 * overlap:.0f} % (overlap); take one "
@@ -136,12 +139,6 @@ class LatticeMode:
         """(w,) changes of the wave vectors by snapping, over their lengths [-]."""
         k, to = self.measured.vectors, self.snapped.vectors
         return np.asarray(np.linalg.norm(to - k, axis=1) / np.linalg.norm(k, axis=1))
-
-    def overlap(self, waves: PlaneWaves) -> float:
-        """Cosine between the snapped pattern and one of the same wave vectors [-]."""
-        pairs = [(getattr(self.snapped, n), getattr(waves, n)) for n in ("cosine", "sine")]
-        a, b = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
-        return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
 
     def deviation(self, mode: FourierMode, covariance: FloatArray) -> float:
         """By how many standard deviations snapping changes a wave vector, at most of all [-].
@@ -180,10 +177,10 @@ class ModeParameters:
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> ModeParameters:
         """From plain values."""
-        arrays = (content[key] for key in ("values", "by_noise", "by_model_error", "of_fields"))
-        known = (None if a is None else np.array(a, dtype=np.float64) for a in arrays)
-        names, units, sds = (tuple(content[key]) for key in ("names", "units", "deviations"))
-        return cls(names, units, *known, deviations=sds)  # type: ignore[arg-type, misc]
+        made = {"names": tuple, "units": tuple, "deviations": tuple}
+        given = {k: v for k, v in content.items() if v is not None}
+        known: dict[str, Any] = {k: made.get(k, np.array)(v) for k, v in given.items()}
+        return cls(**known)
 
     @property
     def covariance(self) -> FloatArray:
@@ -243,16 +240,14 @@ class ParameterEffect:
 
 
 def with_errors(
-    response: Response, parameters: ModeParameters,
-    modes: Callable[[FloatArray], Sequence[LatticeMode]],
+    response: Response, measured: MeasuredModes,
     predicted: Callable[[Sequence[LatticeMode]], Response],
 ) -> tuple[Response, tuple[ParameterEffect, ...]]:  # fmt: skip
-    """Propagate the covariance of the modes' parameters to the response.
+    """Propagate the covariance of the modes' parameters to the response that they themselves make.
 
-    response : with the parameters themselves.
-    modes : from parameters (m,), snapped.
-    predicted : the response with modes; called once for each parameter that snapping leaves.
+    ``predicted``: the response with modes; called once for each parameter that snapping leaves.
     """
+    parameters, modes = measured.parameters, measured.modes
     m, here = len(parameters.values), modes(parameters.values)
     J, is_snapped = np.zeros((len(response.values), m)), np.zeros(m, bool)
     both = parameters.by_noise, parameters.by_model_error
@@ -263,9 +258,8 @@ def with_errors(
         if not is_snapped[k]:
             J[:, k] = (predicted(there).values_at(response) - response.values) / step[k]
     count = len(response.states)
-    for cause, C in zip(
-        ("", "_noise", "_model_error"), (parameters.covariance, *both), strict=True
-    ):
+    causes = {"": parameters.covariance, "_noise": both[0], "_model_error": both[1]}
+    for cause, C in causes.items():
         if C is not None:
             sd: list[Any] = [_known(sd) for sd in np.sqrt(np.einsum("ik,kl,il->i", J, C, J))]
             force, energy = f"force_sd{cause}_N_per_mm", f"energy_sd{cause}_N"

@@ -26,6 +26,11 @@ from modeharvest.util.arrays import FloatArray
 # Forces must be smaller than what a change of the load by this would make.
 _LOAD_TOLERANCE = 1e-11
 _AMPLITUDE_TOLERANCE = 1e-11  # relative
+_ITERATIONS = 12
+_SMALLEST_STEP = 1e-6  # of the load
+_BACK = 1e-4  # of the load: to where the rate of an eigenvalue is taken
+_NOT_CONVERGED = "Newton's method did not converge"
+_REVERSED = "an element would be turned inside out (det F <= 0)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,13 +192,6 @@ class LinearisedCell(CondensedCell):
         )  # fmt: skip
 
 
-_ITERATIONS = 12
-_SMALLEST_STEP = 1e-6  # of the load
-_BACK = 1e-4  # of the load: to where the rate of an eigenvalue is taken
-_NOT_CONVERGED = "Newton's method did not converge"
-_REVERSED = "an element would be turned inside out (det F <= 0)"
-
-
 class PeriodicCell:
     """One cell of a lattice with a material: what its equilibrium equations need.
 
@@ -243,8 +241,7 @@ class PeriodicCell:
 
         Where there is none, the reason.
         """
-        F: FloatArray = loading.axes.T @ guess[:4]
-        w = guess[4:]
+        F, w = loading.axes.T @ guess[:4], guess[4:]
         for _ in range(_ITERATIONS):
             F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
             system = LinearisedCell(self, loading, load, F, w, amplitude)

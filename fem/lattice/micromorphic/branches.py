@@ -73,20 +73,18 @@ def homogenize(
     criticals: list[HomogenizedCritical] = []
     block, pending = "all", list(wanted)
     ranked: list[tuple[tuple[float, ...], HomogenizedState]] = []
-
-    def result(outcome: str) -> Homogenized:
-        known = tuple(met), tuple(criticals), outcome, path.linearisations
-        return Homogenized(*known, tuple(ranked))
-
-    while pending:
-        if not path.follow_primary(pending[0], block):
-            return result(f"no equilibrium of the primary path beyond {path.states[-1].load:.6g}")
-        here = path.states[-1]
+    outcome = ""
+    while pending and not outcome:
+        is_found, here = path.follow_primary(pending[0], block), path.states[-1]
+        if not is_found:
+            outcome = f"no equilibrium of the primary path beyond {here.load:.6g}"
+            break
         progress(here.load, wanted[-1], "primary path")
         if is_unstable(here, block):
             found = path.critical(block)
             if found is None:
-                return result(f"the critical point below the load {here.load:.6g} got lost")
+                outcome = f"the critical point below the load {here.load:.6g} got lost"
+                break
             criticals.append(found)
             if found.kind == "pattern":
                 if len(found.modes) > 1:
@@ -94,13 +92,14 @@ def homogenize(
                 pattern = ranked[0][0] if ranked else None
                 states, outcome = follow_branch(path, found, pending, pattern, progress)
                 met += states
-                return result(outcome)
             block = "pattern" if found.kind == "displacement" else ""
             continue
         if here.load >= pending[0] - 1e-12:
             met.append(here)
             pending.pop(0)
-    return result(f"followed to the load {met[-1].load:.6g}")
+    outcome = outcome or f"followed to the load {met[-1].load:.6g}"
+    known = tuple(met), tuple(criticals), outcome, path.linearisations
+    return Homogenized(*known, tuple(ranked))
 
 
 def follow_branch(
@@ -119,23 +118,24 @@ def follow_branch(
     along = _combined(path, critical, pattern)
     mode = critical.modes[0] if along is None else along
     weights = path.scale * mode / float(mode @ (path.scale * mode))
-    start = _start(path, critical, mode)
-    points, found, name = [start], list[HomogenizedState](), "buckled"
-    origin = float(weights @ start.value[: path.body.free_count])
-    first = path.options.first_amplitude * path.pitch
-    reach = first
+    before = critical.state
+    value = before.value + (critical.load - before.load) * before.rate
+    leaves = LinearisedBody(path.body, before.load, before.value).moved(mode, 0.0, relax=False)
+    points, found = [BranchPoint(0.0, critical.load, 0.0, value, leaves)], list[HomogenizedState]()
+    origin = float(weights @ value[: path.body.free_count])
+    reach = first = path.options.first_amplitude * path.pitch
     while len(found) < len(loads):
         target, amplitude = loads[len(found)], reach
         if reach > _FARTHEST * path.pitch:
             return found, f"the pattern has grown to {_FARTHEST} of the pitch"
         is_near = load_at(points, reach) >= target
         if is_near:
-            before = points[-1] if points[-1].load < target else points[-2]
-            amplitude = amplitude_at(points, target, before.amplitude, reach)
-            state = path.equilibrium(target, value_at(points, amplitude), branch=name)
+            below = points[-1] if points[-1].load < target else points[-2]
+            amplitude = amplitude_at(points, target, below.amplitude, reach)
+            state = path.equilibrium(target, value_at(points, amplitude), branch="buckled")
         else:
             guess = load_at(points, amplitude), value_at(points, amplitude)
-            state = path.equilibrium(*guess, weights, origin + amplitude, branch=name)
+            state = path.equilibrium(*guess, weights, origin + amplitude, branch="buckled")
         reached = -1.0
         if state is not None:
             reached = float(weights @ state.value[: path.body.free_count]) - origin
@@ -170,14 +170,6 @@ def _combined(
         return None
     mode = mix @ modes
     return np.asarray(mode / path.largest(mode)[critical.kind != "pattern"])
-
-
-def _start(path: HomogenizedPath, critical: HomogenizedCritical, mode: FloatArray) -> BranchPoint:
-    """The critical point, and the direction in which the branch leaves it."""
-    state = critical.state
-    value = state.value + (critical.load - state.load) * state.rate
-    at = LinearisedBody(path.body, state.load, state.value)
-    return BranchPoint(0.0, critical.load, 0.0, value, at.moved(mode, 0.0, relax=False))
 
 
 def ranked_branches(

@@ -20,10 +20,15 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.lattice.micromorphic.mesh import EDGES, Quadrature, quadrature, specimen_mesh
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading
+from modeharvest.fem.lattice.micromorphic.body import (
+    EDGES,
+    PlateLoading,
+    Quadrature,
+    quadrature,
+    specimen_mesh,
+)
 from modeharvest.fem.lattice.micromorphic.rve import RVE
-from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
+from modeharvest.fem.materials import JetMatrix, stress_and_tangent
 from modeharvest.fem.sparse_factor import factorise
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
@@ -53,8 +58,8 @@ class HomogenizedBody:
 
     mesh : T3, T6, Q4, Q8 or Q9 [mm].
     rves : one, or several that are averaged at every point.
-    length : L, which the load refers to [mm]; by default the distance of the plates.
-    bulk, is_lattice : material of solid elements, and which (m,) are not solid; by default all.
+    extent : L and the height, which the load refers to [mm]; by default those of the mesh.
+    is_lattice : which elements (m,) are not solid, of the RVEs' material; by default all.
     points : Gauss points a direction; by default 2, of Q9, which 2 would leave loose, 3.
     edges : nodes of plates and sides, by names among ``EDGES``; by default those of least and
         largest x and y.
@@ -62,11 +67,11 @@ class HomogenizedBody:
 
     def __init__(
         self, mesh: Mesh, rves: RVE | Sequence[RVE], loading: PlateLoading,
-        length: float | None = None, bulk: Material | None = None,
-        is_lattice: BoolArray | None = None, points: int | None = None,
+        extent: ArrayLike | None = None, is_lattice: BoolArray | None = None,
+        points: int | None = None,
         comm: MPI.Comm = MPI.COMM_WORLD, edges: Mapping[str, IntArray] | None = None,
     ) -> None:  # fmt: skip
-        self.mesh, self.loading, self.bulk, self.comm = mesh, loading, bulk, comm
+        self.mesh, self.loading, self.comm = mesh, loading, comm
         self.rves = (rves,) if isinstance(rves, RVE) else tuple(rves)
         lattice = np.ones(len(mesh.cells), bool) if is_lattice is None else np.asarray(is_lattice)
         counts = {rve.mode_count for rve in self.rves}
@@ -74,20 +79,19 @@ class HomogenizedBody:
             raise InputError(f"RVEs: expected one or more with as many modes, got {counts}")
         if lattice.shape != (len(mesh.cells),) or not lattice.any():
             raise InputError("homogenized body: expected one element or more of lattice, got none")
-        if bulk is None and not lattice.all():
-            raise InputError("homogenized body: expected a material of the bulk, got none")
         self.mode_count, self.is_lattice = counts.pop(), lattice
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
         self.copies = 4 if loading.quarter else 1
         """How many such bodies make up the whole."""
-        self.length = float(length or (high - low)[0] * math.sqrt(self.copies))
+        whole = (high - low) * math.sqrt(self.copies) if extent is None else np.asarray(extent)
+        self.length = float(whole[0])
         self._lattice_nodes = np.unique(mesh.cells[lattice])
         points = points or (3 if mesh.element == "Q9" else 2)
         self._require_memory(points)
         self.regions = [self._region(lattice, points, self.mode_count)]
         if not lattice.all():
             self.regions.append(self._region(~lattice, points, 0))
-        self._constrain(low, high, edges or {})
+        self._constrain(low, high, 0.5 * float(whole[1]), edges or {})
         self.point_count = self.regions[0].at.weights.size
         count = self.point_count * len(self.rves)
         if comm.size > count:
@@ -100,16 +104,13 @@ class HomogenizedBody:
     @classmethod
     def of_specimen(
         cls, specimen: Specimen, rves: RVE | Sequence[RVE], loading: PlateLoading,
-        bulk: Material | None = None, divisions: tuple[int, int] | None = None, points: int = 2,
-        comm: MPI.Comm = MPI.COMM_WORLD, edge_shifts: ArrayLike = (0.0, 0.0),
+        divisions: tuple[int, int] | None = None, edge_shifts: ArrayLike = (0.0, 0.0),
+        points: int | None = None,
     ) -> HomogenizedBody:  # fmt: skip
-        """A rectangle of holes with its bulk edges, of the RVEs' material unless given.
-
-        ``edge_shifts``: as ``specimen_mesh`` takes them.
-        """
+        """A rectangle of holes with its bulk edges; divisions and shifts as ``specimen_mesh``'s."""
         mesh, lattice = specimen_mesh(specimen, divisions, loading.quarter, edge_shifts)
-        solid = bulk or (rves if isinstance(rves, RVE) else rves[0]).material
-        return cls(mesh, rves, loading, specimen.length, solid, lattice, points, comm)
+        extent = specimen.length, 2.0 * specimen.half_size[1]
+        return cls(mesh, rves, loading, extent, lattice, points)
 
     def rve(self, number: int | np.int64) -> RVE:
         """The RVE of a number among those of all points."""
@@ -179,16 +180,18 @@ class HomogenizedBody:
         dofs = cells[..., None] * (2 + self.mode_count) + np.arange(2 + m)
         return _Region(at, B.reshape(c, p, -1, k * (2 + m)), dofs.reshape(c, -1))
 
-    def _constrain(self, low: FloatArray, high: FloatArray, edges: Mapping[str, IntArray]) -> None:
+    def _constrain(
+        self, low: FloatArray, high: FloatArray, b: float, edges: Mapping[str, IntArray]
+    ) -> None:
         """Which unknowns are free, which follow another one, and how the load moves the rest."""
         nodes, loading, n = self.mesh.nodes, self.loading, len(self.mesh.nodes)
-        near, half = 1e-6 * float((high - low).max()), 0.5 * (high - low)
+        near, half = 1e-6 * float((high - low).max()), np.array([0.5 * (high - low)[0], b])
         is_at = [near > np.abs(nodes - end)[:, axis] for end in (low, high) for axis in (0, 1)]
         for k, name in enumerate(EDGES):
             is_at[k] = np.isin(np.arange(n), edges[name]) if name in edges else is_at[k]
         left, bottom, right, top = is_at
         plates, sides = left | right, bottom | top
-        x, y = ((nodes - low) / half - 1.0).T
+        x, y = ((nodes - 0.5 * (low + high)) / half).T
         x = np.where(plates, 1.0 * right - left, x)
         fixed, direction = np.zeros((2, n, 2 + self.mode_count))
         if loading.quarter:
@@ -199,7 +202,7 @@ class HomogenizedBody:
             fixed[edge[np.argmin(np.abs(y[edge]))], 1] = True
         push = 0.5 * self.length * x
         direction[:, 0] = -push * (loading.compression + loading.bending * y)
-        direction[:, 1] = push * loading.shear - loading.lateral * half[1] * y
+        direction[:, 1] = push * loading.shear - loading.lateral * b * y
         fixed[plates, 0] = True
         fixed[plates & (loading.plates == "clamped"), 1] = True
         fixed[sides & (loading.sides in ("guided", "clamped")), 1] = True
@@ -271,9 +274,8 @@ class HomogenizedBody:
     def bulk_response(self, strains: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Energy density (p,), P (p, 4) and moduli (p, 4, 4) [MPa] of the bulk at F̄ (p, 4)."""
         F = strains.reshape(-1, 2, 2)
-        P, A = stress_and_tangent(self.bulk, F)
-        assert self.bulk is not None
-        return self.bulk.energy(JetMatrix(F)).value, P.reshape(-1, 4), A.reshape(-1, 4, 4)
+        P, A = stress_and_tangent(material := self.rves[0].material, F)
+        return material.energy(JetMatrix(F)).value, P.reshape(-1, 4), A.reshape(-1, 4, 4)
 
     def gathered(self, own: FloatArray) -> FloatArray:
         """(points, RVEs a point, ...) on all ranks, from this rank's RVEs (l, ...)."""

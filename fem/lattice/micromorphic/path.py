@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import eigh
 from scipy.optimize import bisect, brentq
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import eigsh
 
 from modeharvest.fem.experiment import SMALLEST_STEP, PathOptions
@@ -153,6 +153,8 @@ class HomogenizedPath:
         energy = float(areas[0] @ every[..., 0].mean(axis=1))
         if len(areas) > 1:
             energy += float(areas[1] @ body.bulk_response(strains[1])[0])
+        chosen = np.flatnonzero(body.is_pattern)
+        K = at.stiffness[chosen][:, chosen].sorted_indices()
         stresses = at.stresses + np.einsum("pst,pt->ps", at.moduli, strains[0] - at.strains)
         work_rate = body.direction @ (at.forces + (load - at.load) * at.along_load)
         return HomogenizedState(
@@ -160,14 +162,10 @@ class HomogenizedPath:
             force=body.copies * float(work_rate + at.load_force @ dy) / body.length,
             energy=body.copies * energy, displacement=u, amplitudes=v, strains=strains[0],
             stresses=stresses, negative_eigenvalues=at.negative, rve_negative=at.rve_negative,
-            pattern_negative=self._pattern_negative(at.stiffness), value=value,
+            pattern_negative=factorise(K, definite=False).negative_pivots if len(chosen) else 0,
+            value=value,
             rate=at.moved(at.along, 1.0, relax=False), branch=branch,
         )  # fmt: skip
-
-    def _pattern_negative(self, stiffness: csr_array) -> int:
-        chosen = np.flatnonzero(self.body.is_pattern)
-        K = stiffness[chosen][:, chosen].sorted_indices()
-        return factorise(K, definite=False).negative_pivots if len(chosen) else 0
 
     def follow_primary(self, load: float, block: str = "") -> bool:
         """Extend ``states`` to a load, or to the first state where a block is unstable.

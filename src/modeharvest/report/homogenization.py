@@ -37,6 +37,7 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
     """
     table = ReportTable.of("homogenized-states", map(_state_row, _pairs(summary)))
     branches = ReportTable.of("homogenized-branches", map(_branch_row, summary["branches"]))
+    effects = ReportTable.of("homogenized-effects", map(_effect_row, summary["sensitivities"]))
     return Report(
         kind="homogenization", title=summary["title"], findings=findings(summary),
         keys=key_numbers(summary),
@@ -45,7 +46,7 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
             Section.of("homogenized-states",
                        [*Card.tabular(table, wide=True), *Card.tabular(branches)]),
             Section.of("homogenized-amplitude", _amplitude_cards(data)),
-            Section.of("homogenized-mode", _mode_cards(summary)),
+            Section.of("homogenized-mode", Card.tabular(effects, wide=True)),
         ],
         warnings=[
             *summary["warnings"],
@@ -128,16 +129,12 @@ def findings(summary: Summary) -> list[str]:
 def key_numbers(summary: Summary) -> list[KeyNumber]:
     """The few numbers at the top."""
     critical, direct = summary["critical_strain"], summary["direct"]["critical_strain"]
-    keys = []
-    if critical is not None:
-        off = _off(critical, direct)
-        remark = "" if off is None else f"{off:+.1f} % from the direct simulation's"
-        keys.append(KeyNumber.of("homogenized-critical", f"{100 * critical:.3f}", remark=remark))
-    if direct is not None:
-        keys.append(KeyNumber.of("direct-critical", f"{100 * direct:.3f}"))
-    first = summary["first_order_critical_strain"]
-    if first is not None:
-        keys.append(KeyNumber.of("first-order-critical", f"{100 * first:.3f}"))
+    off = _off(critical, direct)
+    remark = "" if off is None else f"{off:+.1f} % from the direct simulation's"
+    strains = {"homogenized-critical": critical, "direct-critical": direct,
+               "first-order-critical": summary["first_order_critical_strain"]}  # fmt: skip
+    keys = [KeyNumber.of(name, f"{100 * strain:.3f}", remark=remark)
+            for name, strain in strains.items() if strain is not None]  # fmt: skip
     pairs = [(state, other) for state, other in _pairs(summary) if other is not None]
     for state, other in pairs[-1:]:
         for name, key in (("force", "force_N_per_mm"), ("energy", "energy_N")):
@@ -202,14 +199,6 @@ def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:
     cards.append(("Microstructure", rves, "microstructure"))
     return [Card(f"{name} {at}", made, wide=True, caption=text_of(f"homogenized-{text}"))
             for name, made, text in cards]  # fmt: skip
-
-
-def _mode_cards(summary: Summary) -> list[Card]:
-    effects = summary["sensitivities"]
-    if not effects:
-        return []
-    rows = [_effect_row(effect) for effect in effects]
-    return Card.tabular(ReportTable.of("homogenized-effects", rows), wide=True)
 
 
 def _effect_row(effect: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.tri import Triangulation
 
 from modeharvest.fem.field import Mesh
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above, ring
 from modeharvest.report.figures.maps import WIDTH, ColourScale, bare_axes, colour_bar
 from modeharvest.report.figures.style import BLUE, EDGE, GREEN, MUTED, RED, draw_path
-from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.elements import reference_element, shape_functions
 
 _FINE = 8
@@ -78,13 +76,13 @@ def draw_amplitude(
     low, high = at.min(axis=0) - margin, at.max(axis=0) + margin
     drawn, axes = bare_axes(_WIDTH, high - low, 0.78, _ROOM, _ROOM)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    has = np.isfinite(values[mesh.cells]).all(axis=1)
-    points, triangles, N = _refined(mesh, mesh.cells[has], displacement)
-    shown = np.einsum("pk,ck->cp", N, values[mesh.cells[has]]).ravel()
-    x, y = points.T
-    axes.tripcolor(Triangulation(x, y, triangles), shown, shading="gouraud", rasterized=True,
-                   cmap=scale.colours, norm=scale.normalise)  # fmt: skip
-    _draw_sides(axes, mesh, displacement)
+    grids = _within(mesh, np.column_stack([at, values]))
+    for x, y, shown in grids[np.isfinite(grids).all(axis=(1, 2, 3))]:
+        axes.pcolormesh(x, y, shown, shading="gouraud", rasterized=True,
+                        cmap=scale.colours, norm=scale.normalise)  # fmt: skip
+    sides = (grids[:, :2, 0], grids[:, :2, -1], grids[:, :2, :, 0], grids[:, :2, :, -1])
+    lines = np.concatenate(sides).swapaxes(1, 2)
+    axes.add_collection(LineCollection(list(lines), colors=MUTED, lw=0.5, zorder=3))
     colour_bar(axes, scale)
     return drawn
 
@@ -101,30 +99,11 @@ def draw_microstructure(rve: Mesh, displacement: FloatArray) -> Figure:
     return drawn
 
 
-def _refined(
-    mesh: Mesh, cells: IntArray, displacement: FloatArray
-) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Points (c p, 2) and triangles inside of elements, and their shape functions (p, k)."""
-    t = np.linspace(0.0, 1.0, _FINE + 1)
-    a, b = (places.ravel() for places in np.meshgrid(t, t, indexing="ij"))
-    is_triangle = reference_element(mesh.element).triangular
-    xi = np.stack([a, b * (1.0 - a)] if is_triangle else [2.0 * a - 1.0, 2.0 * b - 1.0], axis=1)
-    N = shape_functions(mesh.element, xi)
-    points = np.einsum("pk,cki->cpi", N, (mesh.nodes + displacement)[cells])
-    i, j = (index.ravel() for index in np.indices((_FINE, _FINE)))
-    k = i * (_FINE + 1) + j
-    right, corner, above = k + _FINE + 1, k + _FINE + 2, k + 1
-    one = np.concatenate([np.stack(s, axis=1) for s in ((k, right, corner), (k, corner, above))])
-    every = one[None] + len(xi) * np.arange(len(cells))[:, None, None]
-    return points.reshape(-1, 2), every.reshape(-1, 3), N
-
-
-def _draw_sides(axes: Axes, mesh: Mesh, displacement: FloatArray) -> None:
-    """The sides of the elements, curved as they are."""
-    reference, t = reference_element(mesh.element), np.linspace(0.0, 1.0, _FINE + 1)[:, None]
-    corners = reference.nodes[: 3 if reference.triangular else 4]
-    at = (mesh.nodes + displacement)[mesh.cells]
-    ends = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    sides = [(1.0 - t) * start + t * end for start, end in ends]
-    lines = [np.einsum("pk,cki->cpi", shape_functions(mesh.element, side), at) for side in sides]
-    axes.add_collection(LineCollection(list(np.concatenate(lines)), colors=MUTED, lw=0.5, zorder=3))
+def _within(mesh: Mesh, nodal: FloatArray) -> FloatArray:
+    """(c, f, p, p) nodal values (n, f) on a grid over each element, up to its sides."""
+    t, reference = np.linspace(0.0, 1.0, _FINE + 1), reference_element(mesh.element)
+    a, b = np.meshgrid(t, t, indexing="ij")
+    xi = [a, b * (1.0 - a)] if reference.triangular else [2.0 * a - 1.0, 2.0 * b - 1.0]
+    N = shape_functions(mesh.element, np.stack(xi, axis=-1).reshape(-1, 2))
+    found = np.einsum("pk,ckf->cfp", N, nodal[mesh.cells])
+    return np.asarray(found.reshape(*found.shape[:2], *a.shape))

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import model_validator
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.lattice.micromorphic.options import PlateLoading, PlateMotion
+from modeharvest.fem.lattice.micromorphic.body import PlateLoading, PlateMotion
 from modeharvest.fem.materials import MATERIALS
 from modeharvest.idic.modes import FAMILIES
 from modeharvest.idic.setup import SquareLatticeOptions
@@ -112,9 +112,10 @@ class HomogenizationOptions:
     mesh: str | None = None
     """A macroscopic mesh of one's own [mm] instead of the specimen, as ``read_body_mesh`` takes it;
     in a case file, relative to that file's folder."""
-    edge_shifts: tuple[float, float] = (0.0, 0.0)
-    """By how much a specimen's lattice is longer and higher at each end, which makes up for what
-    its edges have more or less energy than its inside [mm]; the page says how they are found."""
+    edge_shifts: Literal["find"] | tuple[float, float] = "find"
+    """By how much a specimen's lattice is longer at each plate and higher at each side, which makes
+    up for its edges' energy [mm]; by default as ``micromorphic.edges`` finds them, of a mesh of
+    one's own none."""
     first_order: bool = True
     """Whether to find the critical strain without modes, too."""
     error_bars: bool = True
@@ -124,7 +125,7 @@ class HomogenizationOptions:
         what = "homogenization: expected"
         require_within(f"{what} mesh_size", self.mesh_size, 0.0, above=True)
         require_within(f"{what} positions", self.positions, 1, 100)
-        for shift in self.edge_shifts:
+        for shift in () if isinstance(self.edge_shifts, str) else self.edge_shifts:
             require_within(f"{what} edge_shifts [mm]", shift, -1e3, 1e3)
         for number in self.divisions or ():
             require_within(f"{what} divisions", number, 1, 1000)
@@ -213,6 +214,7 @@ class HomogenizationCase(CaseModel):
     def _can_be_homogenized(self) -> Self:
         experiment, specimen = self.experiment, self.experiment.specimen
         got, is_perfect = specimen.stacking, experiment.is_perfect
+        shifts = self.homogenization.edge_shifts
         for is_wrong, expected in (
             (got == "rectangular" or specimen.diameter_y is not None,
              "round holes in square or triangular stacking, "
@@ -224,6 +226,8 @@ class HomogenizationCase(CaseModel):
              "a specimen without grading, scatter and tilt: one RVE stands for all of it"),
             (experiment.guided and self.is_experiment and not self.quarter,
              "quarter = true for a guided specimen, whose middle line stays straight, got false"),
+            (self.homogenization.mesh and shifts not in ("find", (0.0, 0.0)),
+             f"edge_shifts of a specimen only, not of a mesh of one's own, got {shifts}"),
         ):  # fmt: skip
             if is_wrong:
                 raise InputError(f"homogenization: expected {expected}")

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from modeharvest.fem.bloch.modes import ModeSet, read_modes
-from modeharvest.fem.lattice.micromorphic.mesh import quadrature
+from modeharvest.fem.lattice.micromorphic.body import quadrature
 from modeharvest.fem.lattice.micromorphic.patterns import ModeField, PlaneWaves, rotation_pattern
 from modeharvest.fem.lattice.options import MacroLoading
 from modeharvest.idic.ansatz import Ansatz
@@ -79,10 +79,9 @@ if TYPE_CHECKING:
 _FAR = 3.44
 """Standard deviations by which snapping may change a wave vector: two components are farther off by
 chance in 0.27 % of cases, as one is by 3."""
-_UNUSUAL = 0.01
-"""Share of its length, where they are unknown; of the right lattice it was 0.7 % at most."""
 _SAME = 0.01
-"""By how much a cell of the same lattice may differ in its vectors and its solid share."""
+"""By how much a cell of the same lattice may differ in its vectors and its solid share, and a wave
+without standard deviations in its length; of the right lattice that was 0.7 % at most."""
 _CRITICAL = "load kind negative_before negative_after"
 _WAVES = {"square": [(np.pi, np.pi)], "triangular": [(np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)]}
 """Of the modes by stacking, in the order of ``FAMILIES``: phases along a1 and a2 [rad]."""
@@ -140,9 +139,9 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             body = self._body(self._fields(modes))
             found = self._followed(body, "homogenized specimen")
             response, effects = response_of(found), tuple[ParameterEffect, ...]()
-            if parameters is not None and how.error_bars:
-                predicted = partial(self._predicted, what="error bars")
-                response, effects = with_errors(response, parameters, self._modes_of, predicted)
+            measured = MeasuredModes(parameters, self._modes_of) if parameters else None
+            if measured and how.error_bars:
+                response, effects = with_errors(response, measured, self._predicted)
             first = self._followed(self._body([]), "first order") if how.first_order else None
             content = to_plain({
                 "response": response,
@@ -153,13 +152,13 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                     for pattern, s in found.ranked
                 ],
                 "first_order_critical_strain": first and first.critical and first.critical.load,
+                "edge_shifts_mm": self._edge_shifts,
                 "rves": body.point_count * len(body.rves),
                 "linearisations": found.linearisations,
             })  # fmt: skip
             on_first(lambda: write_json(path, content))
             write_fields(found, body, fields)
-            errors = None if parameters is None else MeasuredModes(parameters, self._modes_of)
-            return path, fields, *self._exported(found, body, errors)
+            return path, fields, *self._exported(found, body, measured)
 
         self.do("homogenize", self._homogenized_key, work, collective=True)
         with reading(path, "a homogenized specimen", "remove it"):
@@ -334,7 +333,11 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             what = f"{max(numbers) + 1} free mode(s), as {specimen.stacking} stacking has"
             got = f"{free} of {len(modes)}; give the numbers of those to use"
             raise InputError(f"mode: expected a result with {what}, got {got}")
-        parameters = self._parameters(result, pair := self._pair)
+        pair: ImagePair | None = None  # that the mode was measured in, if it is there
+        if isinstance(self.case.mode, MeasuredMode):
+            images = ImageSet.read(self.virtual.folder / "images")
+            pair = images.pair(self._measured_strain, camera=self.case.correlation.camera)
+        parameters = self._parameters(result, pair)
         seen = identifiability(result, None if pair is None else pair.mask)
         try:
             found = self._modes_of(parameters.values)
@@ -368,26 +371,17 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         """Refuse modes that snapping changed by more than error bars allow, or warn of them."""
         warnings = list[str]()
         for k, mode in enumerate(found):
-            change = float(mode.wave_change.max())
-            off, most = (deviations[k], _FAR) if deviations else (change, _UNUSUAL)
-            of, got = "lengths (their model error isn't known)", f"one {change:.2%} off"
+            change, most = float(mode.wave_change.max()), f"{_SAME:.0%} of their lengths"
+            is_far, got = change > _SAME, f"one {change:.2%} off, model error unknown"
             if deviations:
-                of, got = "standard deviations", f"one {off:.1f} of them ({change:.2%}) off"
-            if off > most:
-                limit = f"{most:g}" if deviations else f"{most:.0%}"
-                what = f"phi{k + 1}: expected wave vectors within {limit} of their {of}"
-                warnings.append(f"{what} of the lattice's, got {got}: is it of this lattice?")
+                is_far, most = deviations[k] > _FAR, f"{_FAR:g} of their standard deviations"
+                got = f"one {deviations[k]:.1f} of them ({change:.2%}) off"
+            if is_far:
+                what = f"phi{k + 1}: expected wave vectors within {most} of the lattice's"
+                warnings.append(f"{what}, got {got}: is it of this lattice?")
         if warnings and not getattr(self.case.mode, "snap_anyway", False):
             raise InputError(f"{warnings[0]} If so, set snap_anyway = true in [mode]")
         return tuple(warnings)
-
-    @property
-    def _pair(self) -> ImagePair | None:
-        """The images that the mode was measured in, if they are there."""
-        if not isinstance(self.case.mode, MeasuredMode):
-            return None
-        images = ImageSet.read(self.virtual.folder / "images")
-        return images.pair(self._measured_strain, camera=self.case.correlation.camera)
 
     def _parameters(self, result: Result, pair: ImagePair | None) -> ModeParameters:
         """With the covariances that the result, and its images where they are there, have."""
@@ -429,8 +423,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
     def _body(self, modes: Sequence[ModeField]) -> HomogenizedBody:
         """The macroscopic finite elements with their RVEs."""
         experiment, how, cell = self.case.experiment, self.case.homogenization, self._cell
+        from modeharvest.fem.lattice.micromorphic.body import read_body_mesh
         from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
-        from modeharvest.fem.lattice.micromorphic.mesh import read_body_mesh
         from modeharvest.fem.lattice.micromorphic.rve import RVE, spread_positions
 
         specimen, half = experiment.specimen, 0.5 * experiment.specimen.pitch
@@ -442,15 +436,23 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         plates = self.case.plates
         if how.mesh is None:
             return HomogenizedBody.of_specimen(
-                specimen, rves, plates, divisions=how.divisions, edge_shifts=how.edge_shifts
+                specimen, rves, plates, divisions=how.divisions, edge_shifts=self._edge_shifts
             )
         mesh, is_lattice, edges = read_body_mesh(how.mesh)
         if (extent := float(np.ptp(mesh.nodes, axis=0).min())) < specimen.pitch:
             what = f"a body of at least one cell, {specimen.pitch:g} mm"
             raise InputError(f"{how.mesh}: expected {what}, got {extent:.3g} mm; is it in metres?")
-        return HomogenizedBody(
-            mesh, rves, plates, bulk=experiment.material, is_lattice=is_lattice, edges=edges
-        )
+        return HomogenizedBody(mesh, rves, plates, is_lattice=is_lattice, edges=edges)
+
+    @cached_property
+    def _edge_shifts(self) -> tuple[float, float]:
+        """By how much the lattice is longer and higher at each end [mm]."""
+        from modeharvest.fem.lattice.micromorphic.edges import edge_shifts
+
+        how, of = self.case.homogenization, self.case.experiment
+        if how.mesh is not None or isinstance(how.edge_shifts, tuple):
+            return (0.0, 0.0) if how.edge_shifts == "find" else how.edge_shifts
+        return edge_shifts(of.specimen, of.material, how.mesh_size, self.case.plates)
 
     def _followed(self, body: HomogenizedBody, what: str) -> Homogenized:
         from modeharvest.fem.lattice.micromorphic.branches import homogenize
@@ -485,8 +487,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
         return on_first(write)
 
-    def _predicted(self, modes: Sequence[LatticeMode], what: str) -> Response:
-        return response_of(self._followed(self._body([mode.snapped for mode in modes]), what))
+    def _predicted(self, modes: Sequence[LatticeMode]) -> Response:
+        return response_of(self._followed(self._body(self._fields(modes)), "error bars"))
 
     def _data(self) -> HomogenizationData:
         """All that the report shows."""

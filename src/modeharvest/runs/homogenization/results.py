@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from modeharvest.fem.field import Mesh, read_values, write_values
-from modeharvest.fem.lattice.micromorphic.mesh import quadrature
+from modeharvest.fem.lattice.micromorphic.body import quadrature
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.util.arrays import FloatArray
@@ -100,8 +100,6 @@ class HomogenizedFields:
     """Of the first RVE at a point, from its middle [mm]."""
     points: FloatArray
     """(p, 2) where the RVEs are [mm]; of a quarter its own."""
-    copies: int
-    """4 where a quarter was followed, 1 otherwise."""
     states: tuple[StateFields, ...]
 
     @classmethod
@@ -111,7 +109,7 @@ class HomogenizedFields:
             states = file.get("states", {})
             found = tuple(read_values(states[key], StateFields) for key in sorted(states))
             mesh, rve = (read_values(file[name], Mesh) for name in ("mesh", "rve"))
-            return cls(mesh, rve, file["points"][()], int(file.attrs["copies"]), found)
+            return cls(mesh, rve, file["points"][()], found)
 
 
 def response_of(found: Homogenized) -> Response:
@@ -176,6 +174,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
     """The content of ``summary.json``."""
     found, response = data.found, data.found["response"]
     modes, known = data.modes, data.parameters
+    source = "found" if case["homogenization"]["edge_shifts"] == "find" else "given"
     return {
         "title": title,
         "case": dict(case),
@@ -196,6 +195,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
             "errors": known and ("noise" if known.by_model_error is None else "model error"),
         }) if modes else None,
         "sensitivities": found["effects"],
+        "edge_shifts": {"mm": found["edge_shifts_mm"], "source": source},
         **_compared(data),
         "warnings": list(data.warnings),
         "rves": found["rves"],
