@@ -687,6 +687,10 @@ def test_bodies_and_loadings_that_will_not_do_are_refused() -> None:
         HomogenizedBody(on_tips, rve(), LOOSE)
     with pytest.raises(InputError, match="positive Jacobians"):
         HomogenizedBody(inside_out, rve(), LOOSE)
+    ends = np.array([[0.0, 0.0], [8.0, 0.0], [8.0, 8.0], [0.0, 8.0]])
+    corners = Mesh(ends, np.arange(4)[None], "Q4")
+    with pytest.raises(InputError, match="nodes between the supports, got none"):
+        HomogenizedBody(corners, rve(), PlateLoading())
     two_points = HomogenizedBody(Mesh(*nine_nodes(), "Q9"), rve(), FIXED, points=2)
     with pytest.raises(InputError, match=r"stable without load.* take more points"):
         HomogenizedPath(two_points)

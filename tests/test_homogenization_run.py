@@ -96,7 +96,8 @@ def test_a_pattern_and_its_mirror_image_are_one() -> None:
         ({"homogenization": {"centre": [1e9, 0.0]}}, r"a centre \[mm\] of -3.8 to 3.8, got 1"),
         ({"homogenization": {"quater": True}}, "did you mean 'quarter'"),
         ({"homogenization": {"mesh": "b.msh", "edge_shifts": [0.1, 0.0]}}, "not of a mesh"),
-        ({"homogenization": {"edge_shifts": "guess"}}, "edge_shifts"),
+        ({"homogenization": {"edge_shifts": [0.1]}}, r"\['find'\] or tuple.*, got \[0.1\]$"),
+        ({"homogenization": {"edge_shifts": [-4.0, 0.0]}}, r"edge_shifts \[mm\] of -0.95 to 0.95"),
     ],
 )
 def test_what_can_not_be_homogenized_is_refused(
@@ -533,6 +534,10 @@ def test_families_of_modes_are_snapped_and_have_the_specimen_s_pitch(tmp_path: P
     assert parameters is None
     assert [mode.wave_change.max() < 0.01 for mode in modes] == [True, True]
     np.testing.assert_allclose(modes[0].snapped(points), -2 * ideal(points), atol=1e-12)
+    (tmp_path / "list.json").write_text("[]", "utf-8")
+    other = case_of(tmp_path / "case.toml", text.replace("family_*", "list"))
+    with pytest.raises(InputError, match="expected modeharvest-result-"):
+        HomogenizationRun(other, tmp_path / "out")._found_modes()
     write_family(tmp_path / "family_3.json", replace(family, pitch=2.0))
     with pytest.raises(InputError, match=r"the specimen's pitch, 1.9 mm, got 3 of 1.9, 1.91, 2 mm"):
         HomogenizationRun(case, tmp_path / "out")._found_modes()

@@ -240,6 +240,8 @@ class HomogenizedBody:
         self.direction: FloatArray = np.where(place < 0, direction.ravel(), offset.ravel())
         """(size,) derivatives of all unknowns by the load, y fixed."""
         self.free_count, rows = int(is_free.sum()), np.flatnonzero(place >= 0)
+        if not self.free_count:
+            raise InputError("homogenized body: expected nodes between the supports, got none")
         shape = fixed.size, self.free_count
         self.T = csr_array((np.ones(len(rows)), (rows, place[rows])), shape)
         """(size, free_count): all unknowns are T y + load * direction."""

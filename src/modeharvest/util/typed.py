@@ -121,8 +121,12 @@ def described(error: ValidationError, model: type[Any] | None, skipped: int = 0)
 
     ``skipped``: how many steps of the fault's place are not the user's.
     """
-    first = error.errors()[0]
-    place = first["loc"][skipped:]
+    errors = error.errors()
+    first, place, expected = errors[0], errors[0]["loc"][skipped:], errors[0]["msg"]
+    if place and str(place[-1]).startswith("literal["):  # the first of alternatives
+        *at, _ = first["loc"]
+        kinds = (str(e["loc"][len(at)]) for e in errors if [*e["loc"][: len(at)]] == at)
+        place, expected = place[:-1], f"expected {' or '.join(dict.fromkeys(kinds))}"
     where = ".".join(str(part) for part in place)
     if isinstance(first.get("ctx", {}).get("error"), InputError):
         return f"[{where}] {first['ctx']['error']}" if where else str(first["ctx"]["error"])
@@ -131,7 +135,7 @@ def described(error: ValidationError, model: type[Any] | None, skipped: int = 0)
         return f"unknown key {where}{nearest(str(place[-1]), known)}"
     if first["type"] == "missing":
         return f"expected {where}, got none"
-    return f"{where}: {first['msg']}, got {first['input']!r:.80}"
+    return f"{where}: {expected}, got {first['input']!r:.80}"
 
 
 def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[str]:

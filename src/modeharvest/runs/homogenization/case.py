@@ -125,8 +125,6 @@ class HomogenizationOptions:
         what = "homogenization: expected"
         require_within(f"{what} mesh_size", self.mesh_size, 0.0, above=True)
         require_within(f"{what} positions", self.positions, 1, 100)
-        for shift in () if isinstance(self.edge_shifts, str) else self.edge_shifts:
-            require_within(f"{what} edge_shifts [mm]", shift, -1e3, 1e3)
         for number in self.divisions or ():
             require_within(f"{what} divisions", number, 1, 1000)
 
@@ -231,9 +229,10 @@ class HomogenizationCase(CaseModel):
         ):  # fmt: skip
             if is_wrong:
                 raise InputError(f"homogenization: expected {expected}")
-        for x in () if isinstance(self.centre, str) else self.centre:
-            most = 2.0 * specimen.pitch
-            require_within("homogenization: expected a centre [mm]", x, -most, most)
+        for what, chosen, cells in (("a centre", self.centre, 2.0), ("edge_shifts", shifts, 0.5)):
+            for x in () if isinstance(chosen, str) else chosen:
+                most = cells * specimen.pitch
+                require_within(f"homogenization: expected {what} [mm]", x, -most, most)
         if isinstance(self.mode, MeasuredMode) and self.correlation.fixed_mode:
             raise InputError("mode: expected a free mode to be measured, got fixed_mode = true")
         strain = getattr(self.mode, "strain", None)

@@ -245,7 +245,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         mode, pitch = self.case.mode, self.case.experiment.specimen.pitch
         if not isinstance(mode, FileMode) or mode.is_computed:
             return []
-        if read_json(mode.files[0]).get("format") != FAMILY_FORMAT:
+        content = read_json(mode.files[0])
+        if not isinstance(content, dict) or content.get("format") != FAMILY_FORMAT:
             return []
         found, count = [read_family(path) for path in mode.files], max(mode.numbers, default=1)
         if len(found) < count or any(abs(f.pitch / pitch - 1.0) > _SAME for f in found):
