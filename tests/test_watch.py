@@ -82,7 +82,7 @@ def test_what_does_not_grow_predicts_nothing() -> None:
 def test_a_prediction_stays_once_buckling_is_near() -> None:
     load = np.linspace(0.005, 0.13, 26)
     amplitude = np.where(load < 0.097, grown(np.minimum(load, 0.097)), 200.0)
-    found = follow_growth(load.tolist(), amplitude.tolist(), [0.01] * 26)
+    found = follow_growth(np.array([load, amplitude, 0.0 * load + 0.01]))
     assert found[3] is None
     assert found[-1] == found[20]
     assert found[-1] is not None

@@ -2,8 +2,9 @@
 
 An imperfect specimen's pattern grows from the beginning, a = c p + a0 p / (p_c - p) with the load
 p: the second term is the critical mode's, with an imperfection a0 (R. V. Southwell, Proc. R. Soc.
-A 135 (1932), doi 10.1098/rspa.1932.0055), the first that of all others, which are far from theirs.
-So p / (a - c p) = (p_c - p) / a0: a straight line that ends at the critical load.
+A 135 (1932), doi 10.1098/rspa.1932.0055), the first that of all others, which are far from theirs,
+and of the model error. Of each p_c the posterior probability is computed, c, a0 and the error that
+all images have in common integrated out.
 
 Modes differ by their envelopes. The critical one's is a half wave across the lattice both ways, and
 :func:`half_wave` picks its amplitude out of v; the others' are nearly orthogonal to it.
@@ -15,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.result import Result
@@ -28,10 +28,15 @@ NEAR = 0.9
 OF_METHOD = 0.015
 """Standard deviation of a prediction without noise, of the critical load: see
 docs/how-to/sequences.md."""
-_SURE = 0.95
-_FAR = 10.0
-"""Times the largest load: growth that points further isn't seen."""
-_TRIED = 4000
+_QUANTILES = (0.025, 0.5, 0.975)
+_COMMON = 0.5
+"""Share of the amplitudes' variance by noise of the reference, which all images have in common."""
+_OTHERS, _OF_MODEL = 0.15, 1.0
+"""c is expected to be so much of a0 / p_c, and so many standard deviations of the last amplitude
+over its load, by model error, give or take: see docs/how-to/sequences.md."""
+_FAR, _NEGLIGIBLE = 10.0, 0.02
+"""Times the largest load: growth that points further, by a density over its largest, isn't seen."""
+_TRIED, _ROUNDS = 2000, 4
 _POINTS = 41
 
 
@@ -42,7 +47,7 @@ class Prediction:
     critical: float
     low: float
     high: float
-    """And its interval of 95 %; infinite where growth isn't told from a straight line."""
+    """The median's interval of 95 %; infinite where growth isn't told from a straight line."""
     imperfection: float
     """a0, in the unit of the amplitudes."""
     linear: float
@@ -91,48 +96,47 @@ def predict(load: FloatArray, amplitude: FloatArray, sd: FloatArray) -> Predicti
     load, amplitude, sd = load[used], amplitude[used], sd[used]
     if len(load) < FEWEST or not (sd > 0.0).all():
         return None
-    top = float(load.max())
-    tried = top * np.geomspace(1.0 + 1e-3, _FAR, _TRIED)
-    # For each critical load the best c and a0; c is expected to be some a0 / p_c, or less.
-    pole, line, a = load / (tried[:, None] - load) / sd, load / sd, amplitude / sd
-    own, both, square = line @ line, pole @ line, (pole**2).sum(axis=1)
-    first, second = line @ a, pole @ a
-    own = own + (tried / np.maximum(np.abs(second / square), 1e-300)) ** 2
-    lines, strengths = (
-        (first * square - both * second, own * second - both * first)
-        / (own * square - both**2)
-    )  # fmt: skip
-    left = a - lines[:, None] * line - strengths[:, None] * pole
-    cost = (left**2).sum(axis=1) + (own - line @ line) * lines**2
-    best = int(np.argmin(cost))
-    free = len(load) - 3
-    scatter = max(1.0, float(cost[best]) / free)
-    reach = float(student.ppf(0.5 * (1.0 + _SURE), free)) ** 2 * scatter
-    inside = np.flatnonzero(cost <= cost[best] + reach)
-    if strengths[best] * amplitude[np.argmax(load)] <= 0.0:
+    last = int(np.argmax(load))
+    tried = load[last] * np.geomspace(1.0 + 1e-3, _FAR, _TRIED)
+    weight = 1.0 / (sd * np.sqrt(1.0 - _COMMON))
+    columns = np.stack(np.broadcast_arrays(load / (tried[:, None] - load), load, sd), axis=1)
+    columns, a = columns * weight, amplitude * weight
+    normal, right = columns @ columns.swapaxes(1, 2), columns @ a
+    by_model, scatter = _OF_MODEL * sd[last] / load[last], 1.0
+    linear = np.full(_TRIED, np.hypot(by_model, amplitude[last] / load[last]))
+    for _ in range(_ROUNDS):  # for each critical load the best a0, c and what errors have in common
+        prior = np.stack([0.0 * tried, scatter / linear**2, 0.0 * tried + 1.0 / _COMMON], axis=1)
+        A = normal + prior[:, None] * np.eye(3)
+        found = np.linalg.solve(A, right[..., None])[..., 0]
+        cost = (a @ a - (right * found).sum(axis=1)) / scatter
+        chance = -0.5 * cost - 0.5 * np.linalg.slogdet(A)[1] - np.log(linear)
+        best = int(np.argmax(chance))
+        scatter = max(1.0, float(cost[best]) * scatter / (len(load) - 3))
+        linear = np.hypot(by_model, _OTHERS * np.abs(found[:, 0]) / tried)
+    share = np.exp(chance - chance[best])
+    quantiles = np.interp(_QUANTILES, np.cumsum(share) / share.sum(), tried)
+    k = int(np.searchsorted(tried, quantiles[1]))
+    if found[k, 0] * amplitude[last] <= 0.0:
         return None
-    critical, method = float(tried[best]), 2.0 * OF_METHOD * float(tried[best])
-    low, high = (float(np.hypot(tried[end] - critical, method)) for end in inside[[0, -1]])
+    critical = float(quantiles[1])
+    below, _, above = np.hypot(quantiles - critical, 2.0 * OF_METHOD * critical).tolist()
     return Prediction(
-        critical, critical - low, critical + high if inside[-1] < _TRIED - 1 else float("inf"),
-        float(strengths[best]), float(lines[best]), top, len(load),
+        critical, critical - below, critical + above if share[-1] < _NEGLIGIBLE else float("inf"),
+        float(found[k, 0]), float(found[k, 1]), float(load[last]), len(load),
     )  # fmt: skip
 
 
 def follow_growth(
-    load: Sequence[float], amplitude: Sequence[float], sd: Sequence[float]
+    columns: FloatArray, known: Sequence[Prediction | None] = ()
 ) -> list[Prediction | None]:
-    """The prediction after each image of a test, in their order.
+    """The prediction after each image of a test, in their order; of the first ones it is known.
 
-    It stays as it is once the load is beyond nine tenths of it, as buckling no longer lies ahead,
-    and on the way back.
+    ``columns`` (3, n): as for :func:`predict`. A prediction stays as it is once the load is beyond
+    nine tenths of it, as buckling no longer lies ahead, and on the way back.
     """
-    found: list[Prediction | None] = []
-    last: Prediction | None = None
-    for n in range(1, len(load) + 1):
-        p, a, s = (np.array(part[:n], np.float64) for part in (load, amplitude, sd))
-        is_ahead = last is None or not last.is_useful or p[-1] < NEAR * last.critical
-        if is_ahead and p[-1] >= p.max():
-            last = predict(p, a, s)
-        found.append(last)
+    found = list(known)
+    for n in range(len(found) + 1, columns.shape[1] + 1):
+        load, last = columns[0, :n], found[-1] if found else None
+        is_ahead = last is None or not last.is_useful or load[-1] < NEAR * last.critical
+        found.append(predict(*columns[:, :n]) if is_ahead and load[-1] >= load.max() else last)
     return found

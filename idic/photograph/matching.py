@@ -80,17 +80,11 @@ def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[Hol
     )
     most = max(steps.values())
     rivals = sum(count == most for count in steps.values()) - 1
-    motions = [
-        _motion(reference, deformed, index + step, rivals)
-        for step, count in steps.items()
-        if count >= _RIVAL * most
-    ]
-
-    def rank(motion: HoleMotion) -> tuple[int, float]:
-        shift = (motion.after - motion.before).mean(axis=0)
-        return -len(motion), float(np.linalg.norm(shift))
-
-    return tuple(sorted(motions, key=rank))
+    likely = [step for step, count in steps.items() if count >= _RIVAL * most]
+    motions = [_motion(reference, deformed, index + step, rivals) for step in likely]
+    shifts = [np.linalg.norm((m.after - m.before).mean(axis=0)) for m in motions]
+    order = sorted(range(len(motions)), key=lambda k: (-len(motions[k]), shifts[k]))
+    return tuple(motions[k] for k in order)
 
 
 @dataclass(frozen=True)

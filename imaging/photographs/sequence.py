@@ -73,11 +73,8 @@ def pictures_in(folder: Path) -> tuple[Path, ...]:
 
 def numbered(paths: Iterable[Path]) -> tuple[SequenceFrame, ...]:
     """Photographs as frames, with the last number of each name."""
-    frames = []
-    for path in paths:
-        digits = re.findall(r"\d+", path.stem)
-        frames.append(SequenceFrame(path.stem, path, int(digits[-1]) if digits else None))
-    return tuple(frames)
+    digits = ((path, re.findall(r"\d+", path.stem)) for path in paths)
+    return tuple(SequenceFrame(p.stem, p, int(d[-1]) if d else None) for p, d in digits)
 
 
 def odd_numbers(frames: Sequence[SequenceFrame]) -> tuple[str, ...]:
@@ -110,9 +107,7 @@ def times_of(paths: Sequence[Path]) -> tuple[list[float] | None, str]:
 
     The first of these that tells all photographs apart.
     """
-    known = (
-        (_named_time, "names"), (_exif_time, "Exif"), (_changed, "times of change"),
-    )  # fmt: skip
+    known = (_named_time, "names"), (_exif_time, "Exif"), (_changed, "times of change")
     for read, source in known:
         times = [read(path) for path in paths]
         given = [time for time in times if time is not None]
@@ -124,11 +119,7 @@ def times_of(paths: Sequence[Path]) -> tuple[list[float] | None, str]:
 def _named_time(path: Path) -> float | None:
     if match := _DATE.search(path.stem):
         *whole, fraction = match.groups()
-        try:
-            moment = datetime.strptime(" ".join(whole), "%Y %m %d %H %M %S").replace(tzinfo=UTC)
-        except ValueError:
-            return None
-        return moment.timestamp() + float(f"0.{fraction or 0}")
+        return _moment(" ".join(whole), "%Y %m %d %H %M %S", fraction)
     match = _SECONDS.search(path.stem)
     return float(match[1].replace(",", ".")) if match else None
 
@@ -141,11 +132,15 @@ def _exif_time(path: Path) -> float | None:
     except (OSError, ValueError, SyntaxError):
         return None
     text = str(inner.get(_TAKEN) or tags.get(_CHANGED) or "")
+    fraction = re.sub(r"\D", "", str(inner.get(_FRACTION, "")))
+    return _moment(text[:19], "%Y:%m:%d %H:%M:%S", fraction)
+
+
+def _moment(text: str, form: str, fraction: str | None) -> float | None:
     try:
-        moment = datetime.strptime(text[:19], "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+        moment = datetime.strptime(text, form).replace(tzinfo=UTC)
     except ValueError:
         return None
-    fraction = re.sub(r"\D", "", str(inner.get(_FRACTION, "")))
     return moment.timestamp() + float(f"0.{fraction or 0}")
 
 
@@ -186,9 +181,8 @@ class Video:
 
     def frame(self, number: int) -> SequenceFrame:
         """One of its frames, by its number from 0."""
-        return SequenceFrame(
-            f"{self.path.stem}_{number:06d}", self.path, number, number / self.rate
-        )
+        name = f"{self.path.stem}_{number:06d}"
+        return SequenceFrame(name, self.path, number, number / self.rate)
 
     def levels(self, wanted: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Decode frames: their numbers from 0 and grey levels (rows, cols), one at a time.

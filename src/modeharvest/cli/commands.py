@@ -177,6 +177,9 @@ def _analyse(case: str, out: Path, whole: bool) -> None:
     print_report(lattice_report(summary), out)
 
 
+_EXAMPLE = "Print a commented EXPERIMENT.toml with every option, and stop."
+
+
 def _example(wanted: bool) -> None:
     if wanted:
         from modeharvest.runs.case import case_text
@@ -191,13 +194,7 @@ def harvest(
     ],
     out: OutFolder,
     example: Annotated[
-        bool,
-        typer.Option(
-            "--example",
-            callback=_example,
-            is_eager=True,
-            help="Print a commented EXPERIMENT.toml with every option, and stop.",
-        ),
+        bool, typer.Option("--example", callback=_example, is_eager=True, help=_EXAMPLE)
     ] = False,
     whole_field: WholeField = None,
     watch: Annotated[

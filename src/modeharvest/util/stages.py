@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from importlib import resources
 from importlib.metadata import version
 from importlib.resources.abc import Traversable
@@ -177,18 +177,14 @@ class Kept(Mapping[str, R]):
 
     def __init__(self) -> None:
         self._read: dict[str, Callable[[], R]] = {}
-        self._last: tuple[str, R] | None = None
+        self._kept = lru_cache(1)(lambda name: self._read[name]())
 
     def add(self, name: str, read: Callable[[], R]) -> None:
         """Take in one more, the last in their order, and how it is read."""
         self._read[name] = read
 
     def __getitem__(self, name: str) -> R:
-        if self._last is None or self._last[0] != name:
-            read = self._read[name]
-            self._last = None
-            self._last = name, read()
-        return self._last[1]
+        return self._kept(name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._read)

@@ -47,8 +47,7 @@ def write_watch_page(
 
     ``photograph``: the last one, (rows, cols) of any scale.
     """
-    found = test.predictions
-    last = found[-1] if found else None
+    last = next(reversed(test.predictions), None)
     figures = {}
     if photograph is not None:
         figures["The last photograph"] = draw_photograph(photograph)
@@ -103,26 +102,22 @@ def draw_photograph(image: FloatImage) -> Figure:
     return drawn
 
 
-def _columns(test: WatchedTest) -> tuple[FloatArray, FloatArray, FloatArray]:
-    strain, amplitude, sd = (
-        np.array([row[key] for row in test.rows]) for key in ("strain", "amplitude_mm", "sd_mm")
-    )
-    sign = np.sign(amplitude[np.argmax(strain)]) or 1.0
-    return strain, sign * amplitude, sd
+def _interval(axes: Any, found: Prediction) -> None:
+    if found.is_useful:
+        axes.axvspan(100 * found.low, 100 * found.high, color=RED, alpha=0.1, lw=0)
 
 
 def draw_amplitude(test: WatchedTest, found: Prediction | None) -> Figure:
     """Draw v1's half wave over the strain, and the growth that was fitted to it."""
-    strain, amplitude, sd = _columns(test)
+    strain, amplitude, sd = test.columns
     drawn, axes = curve("nominal strain [%]", "v₁, half wave [µm]")
     axes.errorbar(100 * strain, 1e3 * amplitude, 2e3 * sd, fmt="o", color=BLUE, ms=3.5, lw=1)
     if found is not None and found.is_useful:
         p = np.linspace(0.0, 0.97 * found.critical, 200)
-        sign = np.sign(found.imperfection) or 1.0
-        grown = sign * (found.linear + found.imperfection / (found.critical - p)) * p
+        grown = (found.linear + found.imperfection / (found.critical - p)) * p
         top = 1.3 * float(np.abs(amplitude).max())
         axes.plot(100 * p, 1e3 * np.where(np.abs(grown) < top, grown, np.nan), color=MUTED, lw=1)
-        axes.axvspan(100 * found.low, 100 * found.high, color=RED, alpha=0.1, lw=0)
+        _interval(axes, found)
         axes.axvline(100 * found.critical, color=RED, lw=1)
     axes.set(xlim=(0, None))
     return drawn
@@ -130,9 +125,8 @@ def draw_amplitude(test: WatchedTest, found: Prediction | None) -> Figure:
 
 def draw_growth(test: WatchedTest, found: Prediction) -> Figure:
     """Draw strain over amplitude, less its linear part: a line that ends at the critical strain."""
-    strain, amplitude, sd = _columns(test)
-    sign = np.sign(found.imperfection) or 1.0
-    own = amplitude - sign * found.linear * strain
+    strain, amplitude, sd = test.columns
+    own = np.sign(found.imperfection) * (amplitude - found.linear * strain)
     good = (strain > 0) & (own > 2 * sd) & (own > 0.1 * own.max(initial=0.0))
     drawn, axes = curve("nominal strain [%]", "strain / (v₁ − c · strain) [1/mm]")
     value = strain[good] / own[good]
@@ -140,8 +134,7 @@ def draw_growth(test: WatchedTest, found: Prediction) -> Figure:
                   color=BLUE, ms=3.5, lw=1)  # fmt: skip
     ends = np.array([0.0, found.critical])
     axes.plot(100 * ends, (found.critical - ends) / abs(found.imperfection), color=RED, lw=1)
-    if found.is_useful:
-        axes.axvspan(100 * found.low, 100 * found.high, color=RED, alpha=0.1, lw=0)
+    _interval(axes, found)
     axes.set(ylim=(0, None), xlim=(0, None))
     return drawn
 

@@ -114,18 +114,15 @@ def read_log(path: Path, table: LogTable) -> MachineLog:
                     '"..."'
                 )
 
-        def scale(role: str) -> float:
-            return _UNITS[role].get(units[found[role] or 0], 1.0)
-
         def numbers(role: str) -> FloatArray | None:
-            i = found[role]
-            if i is None:
+            if (i := found[role]) is None:
                 return None
-            return scale(role) * np.array([_number(row[i], decimal) for row in body])
+            scale = _UNITS[role].get(units[i], 1.0)
+            return scale * np.array([_number(row[i], decimal) for row in body])
 
         at, date = found["time"] or 0, found["date"]
         stamps = [row[at] if date is None else f"{row[date]} {row[at]}" for row in body]
-        time = _times(stamps, decimal, scale("time"))
+        time = _times(stamps, decimal, _UNITS["time"].get(units[at], 1.0))
         columns = [numbers("force"), numbers("crosshead")]
         keep = np.isfinite([time, *(c for c in columns if c is not None)]).all(axis=0)
         if keep.sum() < 2:
@@ -152,33 +149,24 @@ def offset_between(
     if given is not None:
         return given, (f"The log's clock is taken to be {given:+g} s ahead of the photographs'.",)
     dated = times[0] > _EPOCH
-    if dated and log.is_dated:
-        inside = _share(log, times)
-        if inside == 1.0:
-            return 0.0, ()
-        zones = _ZONE * np.arange(-56, 57)
-        shares = np.array([_share(log, times + zone) for zone in zones])
-        if shares.max() > inside:
-            best = zones[np.flatnonzero(shares == shares.max())]
-            zone = float(best[np.argmin(np.abs(best))])
-            return zone, (
-                f"The log's clock is {zone / 3600:+g} h ahead of the photographs', as in another "
-                "time zone; if that is wrong, give offset_s in [log].",
-            )
-        if inside > 0.0:
-            return 0.0, ()
-        return 0.0, ("No photograph was taken while the log was written; give offset_s in [log].",)
-    begin = float(log.time[0] - times[0]) if dated or log.is_dated else 0.0
-    if begin:
-        return begin, (
+    if not dated or not log.is_dated:
+        begin = float(log.time[0] - times[0]) if dated or log.is_dated else 0.0
+        text = (
             "The log is taken to begin with the first photograph, as only one of them has dates; "
-            "else give offset_s in [log].",
+            "else give offset_s in [log]."
         )
-    return 0.0, ()
-
-
-def _share(log: MachineLog, times: FloatArray) -> float:
-    return float(np.mean((times >= log.time[0] - 1.0) & (times <= log.time[-1] + 1.0)))
+        return begin, (text,) * bool(begin)
+    zones = _ZONE * np.array(sorted(range(-56, 57), key=abs))
+    first, last = log.time[[0, -1]] + (-1.0, 1.0)
+    shares = [np.mean((times + zone >= first) & (times + zone <= last)) for zone in zones]
+    zone = float(zones[int(np.argmax(shares))])  # the smallest of those that are as good
+    if not max(shares):
+        return 0.0, ("No photograph was taken while the log was written; give offset_s in [log].",)
+    text = (
+        f"The log's clock is {zone / 3600:+g} h ahead of the photographs', as in another "
+        "time zone; if that is wrong, give offset_s in [log]."
+    )
+    return zone, (text,) * bool(zone)
 
 
 # -- text --------------------------------------------------------------------------------

@@ -5,7 +5,7 @@
     watch.html    a page that reloads itself
     watch.json    what was measured of every photograph, and the predictions; read after a stop
 
-Each photograph is correlated with a fixed mode on binned pixels, from where the last two point to.
+Each photograph is correlated with fixed modes on binned pixels, from where the last two point to.
 What the harvest of all photographs measures in the end is finer, and has error bars of its own.
 """
 
@@ -24,7 +24,7 @@ from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import ASTRAY, correlate
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import SLOW_DEGREE, first_motion, fit_unknowns
-from modeharvest.idic.modes import turning_family
+from modeharvest.idic.modes import ModeFamily, turning_family
 from modeharvest.idic.photograph.geometry import find_geometry, junction
 from modeharvest.idic.photograph.matching import matched_holes
 from modeharvest.idic.photograph.material import find_material, window_for
@@ -77,6 +77,7 @@ class WatchedTest:
     """``name`` and ``reason``."""
     conclusion: str = ""
     """Why watching has ended; empty while it goes on."""
+    _predicted: list[Prediction | None] = field(default_factory=list)
 
     @classmethod
     def read(cls, path: Path, key: str) -> WatchedTest:
@@ -87,22 +88,26 @@ class WatchedTest:
         return cls(list(content["frames"]), list(content["skipped"]))
 
     @property
+    def columns(self) -> FloatArray:
+        """(3, n) strains [-], amplitudes and their standard deviations [mm]."""
+        keys = "strain", "amplitude_mm", "sd_mm"
+        return np.array([[row[key] for row in self.rows] for key in keys])
+
+    @property
     def predictions(self) -> list[Prediction | None]:
         """The strain of buckling, predicted after each photograph."""
-        columns = ([row[key] for row in self.rows] for key in ("strain", "amplitude_mm", "sd_mm"))
-        strain, amplitude, sd = columns
-        return follow_growth(strain, amplitude, sd)
+        self._predicted = follow_growth(self.columns, self._predicted)
+        return self._predicted
 
     def summary(self) -> dict[str, Any]:
         """As plain JSON values."""
-        found = self.predictions
         content = {"frames": self.rows, "skipped": self.skipped, "conclusion": self.conclusion}
-        plain: dict[str, Any] = to_plain({**content, "prediction": found[-1] if found else None})
-        return plain
+        last: Prediction | None = next(reversed(self.predictions), None)
+        return {**content, "prediction": to_plain(last)}
 
 
 class QuickMeasurement:
-    """Measures photographs one after the other, with one fixed mode, on binned pixels."""
+    """Measures photographs one after the other, with fixed modes, on binned pixels."""
 
     def __init__(self, case: PhotographCase) -> None:
         self.case = case
@@ -127,7 +132,11 @@ class QuickMeasurement:
 
     @cached_property
     def ansatz(self) -> Ansatz:
-        """Its mode is what the lattice of holes allows; InputError if it isn't square."""
+        """Its first mode is what the lattice of holes allows; InputError if it isn't square.
+
+        The others are what all cells do alike, from the beginning: beside one speckle or another
+        some of that would be taken for the first.
+        """
         geometry, cell = self.geometry, self.case.specimen.cell_size
         lattice = geometry.lattice
         if lattice is None or lattice.kind not in ("square", "rectangular"):
@@ -137,9 +146,11 @@ class QuickMeasurement:
                 "the photographs when there are some"
             )
         vectors = cell * np.eye(2) if geometry.lattice_mm is None else geometry.lattice_mm
-        family = turning_family(vectors, cell, junction(lattice, geometry.grid)).fixed()
-        part = geometry.region
-        return Ansatz.on(part.domain, [(family, part.cellular)], cell, _DEGREES)
+        origin, part = np.array(junction(lattice, geometry.grid)), geometry.region
+        first = turning_family(vectors, cell, origin).fixed()
+        families = (first, *periodic_families(vectors, cell, origin))
+        modes = [(family, part.cellular) for family in families]
+        return Ansatz.on(part.domain, modes, cell, _DEGREES)
 
     def measure(self, path: Path) -> dict[str, Any]:
         """Measure one photograph; its row of a test.
@@ -161,16 +172,12 @@ class QuickMeasurement:
         amplitude, sd = half_wave(result, cellular)
         few = self.grid.binned(max(1, round(self._cell_px / 8)))
         inside = cellular.contains(*np.meshgrid(few.x, few.y))
-        pattern = result.fluctuation(0, few)[inside]
+        pattern = result.fluctuation(0, few)[inside] / self.grid.pixel_size
         self.thumbnail = pair.deformed
-        return {
-            "name": path.name,
-            "strain": mean_strain(result, cellular)[0],
-            "amplitude_mm": amplitude,
-            "sd_mm": sd,
-            "pattern_px": float(np.sqrt(np.mean(pattern**2))) / self.grid.pixel_size,
-            "seconds": time.perf_counter() - begin,
-        }
+        strain = mean_strain(result, cellular)[0]
+        row = {"name": path.name, "strain": strain, "amplitude_mm": amplitude, "sd_mm": sd}
+        row["pattern_px"] = float(np.sqrt(np.mean(pattern**2)))
+        return row | {"seconds": time.perf_counter() - begin}
 
     @cached_property
     def _few(self) -> tuple[FloatImage, BoolArray, PixelGrid]:
@@ -192,9 +199,8 @@ class QuickMeasurement:
     def _from_holes(self, frame: Photograph, pair: ImagePair) -> Result:
         """From where the holes have gone, in whatever order photographs come."""
         material = self._material(frame.image)
-        whole = ImagePair(
-            self.reference.image, frame.image, self.grid, self.geometry.mask, material
-        )
+        images = self.reference.image, frame.image
+        whole = ImagePair(*images, self.grid, self.geometry.mask, material)
         motion, _ = matched_holes(whole, self.geometry.lattice)
         holes = None if motion is None else motion.in_mm(self.grid)
         slow, _ = first_motion(self.geometry.region.domain, whole, holes)
@@ -204,6 +210,16 @@ class QuickMeasurement:
         ansatz = self.ansatz
         start = fit_unknowns(ansatz, ansatz.initial_guess(), known, SLOW_DEGREE).coefficients
         return correlate(pair, ansatz, guess=start, options=_CAREFUL)
+
+
+def periodic_families(vectors: FloatArray, cell: float, at: FloatArray) -> list[ModeFamily]:
+    """What all cells of a lattice (2, 2) do alike, first waves about a junction: modes; [mm]."""
+    first, second = 2.0 * cell * np.linalg.inv(vectors).T
+    both, apart = first + second, first - second
+    parts = [(1, 0, *first)], [(0, 1, *second)], [(1, 0, *both), (1, 0, *apart)]
+    waves = [np.array(part) for part in (*parts, [(0, 1, *both), (0, -1, *apart)])]
+    flat = [np.column_stack([part, -part[:, 2:] @ at]).ravel() for part in waves]
+    return [ModeFamily("periodic", np.zeros((p.size, 0)), p, np.zeros(0)) for p in flat]
 
 
 def watch(
@@ -227,7 +243,8 @@ def watch(
         )
     with exclusive(folder):
         measuring = QuickMeasurement(found)
-        key = digest([found.plain(), sha256_of(measuring.reference.path), str(where.absolute())])
+        files = sha256_of(measuring.reference.path), str(where.absolute())
+        key = digest(["periodic modes", found.plain(), *files])
         test = WatchedTest.read(folder / "watch.json", key)
         drawn = 0.0
 
@@ -279,19 +296,16 @@ def arriving(
 def _is_whole(path: Path) -> bool:
     """Whether a file is written to its end: it doesn't grow, and can be read, or never will be."""
     before = path.stat()
-    if time.time() - before.st_mtime < _SETTLED_S:
-        time.sleep(_SETTLED_S)
-        after = path.stat()
-        if (after.st_size, after.st_mtime) != (before.st_size, before.st_mtime):
-            return False
-    if time.time() - before.st_mtime > _GIVEN_UP_S:
+    age = time.time() - before.st_mtime
+    if age > _GIVEN_UP_S:
         return True
+    time.sleep(_SETTLED_S if age < _SETTLED_S else 0.0)
     try:
         read_stored(path)
     except InputError:
         time.sleep(_POLL_S)
         return False
-    return True
+    return path.stat().st_mtime_ns == before.st_mtime_ns
 
 
 def _line(test: WatchedTest) -> str:
@@ -301,6 +315,6 @@ def _line(test: WatchedTest) -> str:
         f"{row['name']}: {100 * row['strain']:.2f} %, pattern {row['pattern_px']:.2f} px, "
         f"{row['seconds']:.1f} s"
     )
-    if found is None or not found.is_useful:
-        return text
-    return f"{text}; buckling at {100 * found.critical:.2f} % ({found.interval})"
+    if found and found.is_useful:
+        text += f"; buckling at {100 * found.critical:.2f} % ({found.interval})"
+    return text
