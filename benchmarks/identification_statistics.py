@@ -134,6 +134,12 @@ def linearised(test: ParametricTest, values: FloatArray, mesh: Mesh | None = Non
                     ])) for s in states
         ]  # fmt: skip
 
+    return linear_about(values, states)
+
+
+def linear_about(values: FloatArray, states: list[ParametricState]) -> Model:
+    """The states of values nearby, by the derivatives of these."""
+
     def near(others: FloatArray) -> list[ParametricState]:
         by = others - values
         return [

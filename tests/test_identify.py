@@ -31,6 +31,7 @@ from modeharvest.idic.finite_element.observed import (
     ImageData,
     imaged,
     rigidly_moved,
+    through_lens,
 )
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
@@ -38,6 +39,7 @@ from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.idic.uncertainty.parameters import undetermined_combinations
+from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
@@ -98,19 +100,22 @@ def pattern(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(0.5 + 0.03 * waves.sum(axis=-1))
 
 
-def images(seed: int, values: FloatArray = TRUE) -> list[ImageData]:
-    rng, pixels = np.random.default_rng(seed), MeshPixels(MESH)
+def images(seed: int, lens: Distortion | None = None, sd: float = NOISE) -> list[ImageData]:
+    """Of both states, through a lens, with noise of a standard deviation."""
+    rng, values, pixels = np.random.default_rng(seed), TRUE, MeshPixels(MESH)
     x, y = np.meshgrid(GRID.x, GRID.y)
+    if lens is not None:
+        x, y = GRID.to_mm(*lens.ideal(*np.mgrid[: GRID.rows, : GRID.cols]))
 
     def noisy(image: FloatArray) -> FloatArray:
-        return image + rng.normal(0.0, NOISE, GRID.shape)
+        return image + rng.normal(0.0, sd, GRID.shape)
 
     f = noisy(pattern(x, y))
     moved = [
         noisy(pattern(x / (1 + e * values[0]), y / (1 + e * values[0] * values[1]))) for e in LOADS
     ]
     noise = ImageNoise(NOISE, NOISE)
-    return [ImageData(ImagePair(f, g, GRID), pixels, noise) for g in moved]  # type: ignore[arg-type]
+    return [ImageData(ImagePair(f, g, GRID), pixels, noise, lens=lens) for g in moved]  # type: ignore[arg-type]
 
 
 UNKNOWNS = {
@@ -209,6 +214,40 @@ def test_a_specimen_that_is_not_in_the_middle_under_a_light_that_changes() -> No
     assert found.statements == ()
     for share in found.state_equations:
         assert share.residual == pytest.approx(share.expected, rel=0.03)
+
+
+LENS = CameraDistortion(200.0, 180.0, 50.0, 40.0, k1=0.3, p1=0.02, p2=-0.01)
+"""By up to 3 px."""
+
+
+def test_points_through_a_lens() -> None:
+    """Derivatives by differences, and the lens' own inverse."""
+    X, step = np.random.default_rng(0).uniform([-2.0, -1.5], [2.0, 1.5], (9, 2)), 1e-5
+    shown, slopes = through_lens(X, LENS, GRID)
+    for j, along in enumerate(np.eye(2) * step):
+        ahead, back = (through_lens(X + s * along, LENS, GRID)[0] for s in (1.0, -1.0))
+        np.testing.assert_allclose(slopes[:, :, j], (ahead - back) / (2.0 * step), atol=1e-9)
+    back = np.column_stack(GRID.to_mm(*LENS.ideal(*GRID.to_px(*shown.T))))
+    np.testing.assert_allclose(back, X, atol=1e-9)
+
+
+def test_a_known_lens() -> None:
+    """Nothing left of images without noise but interpolation; with noise the values are as good."""
+    left = []
+    for lens in (None, LENS):
+        found = identify(
+            model, images(0, lens, 0.0), UNKNOWNS, pixel_size=0.04, forces=FORCES, levels=(FULL,)
+        )
+        np.testing.assert_array_less(np.abs(found.values - TRUE), 0.1 * found.sd)
+        left.append(max(share.residual for share in found.state_equations))
+    assert left[1] < 1.5 * left[0]
+    for seed in range(3):
+        found = identify(
+            model, images(seed, LENS), UNKNOWNS, pixel_size=0.04, forces=FORCES, levels=(FULL,)
+        )
+        assert np.all(np.abs(found.values - TRUE) < 3.5 * found.sd)
+        for share in found.state_equations:
+            assert share.residual == pytest.approx(share.expected, rel=0.03)
 
 
 def test_a_displacement_field_instead_of_images() -> None:

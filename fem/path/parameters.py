@@ -114,8 +114,8 @@ def parameter(name: str, experiment: Experiment) -> Parameter:
         is_symmetric = spec.holes_y % 2 == 0 and degree % 2 == axis
         return Parameter("mm", edge=motion, is_symmetric=is_symmetric)
     known += [TRAVEL, TILT, "amplitude[k]", "holes.x[i,j]", "holes.y[i,j]", "holes.diameter[i,j]"]
-    known += ["holes[k].x", "holes[k].y", "holes[k].diameter", "right.x[j]", "right.y[j]"]
-    known += ["left.x[j]", "left.y[j]"]
+    known += [f"holes[k].{part}" for part in PARTS]
+    known += [f"{side}.{axis}[j]" for side in ("right", "left") for axis in "xy"]
     raise InputError(f"unknowns: expected some of {known}, got {name!r}")
 
 

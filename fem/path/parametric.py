@@ -195,11 +195,8 @@ class ParametricTest:
             known.append(_Known(state, before.branch, by))
         if self.with_critical:  # always by the whole primary path, which is exactly symmetric
             self._vary(first)
-            most, name = (
-                _BEYOND * travel * max(self.experiment.strains),
-                self.experiment.branches[0],
-            )
-            _, self._critical = self._primary(most, (), name)
+            most = _BEYOND * travel * max(self.experiment.strains)
+            _, self._critical = self._primary(most, (), self.experiment.branches[0])
             if self._critical is None:
                 return self.at(values, with_derivatives)
         return self._results(values, known)
@@ -445,10 +442,8 @@ class ParametricTest:
         if np.any(structure.nodes != self._nodes):
             mesh = replace(mesh, nodes=structure.on_shown(structure.nodes))
         names, shape = self.names[: len(by)], (-1, *mesh.nodes.shape)
-        fields, moved = (
-            [structure.nodal(s.displacement) for s in by],
-            [self._moved[n] for n in names],
-        )
+        fields = [structure.nodal(s.displacement) for s in by]
+        moved = [self._moved[n] for n in names]
         of_travel = np.array([name == TRAVEL for name in names], np.float64)
         strain, strain_by = state.strain / travel, np.array([s.strain for s in by])
         return ParametricState(

@@ -27,6 +27,8 @@ from modeharvest.idic.finite_element.result import located, nodal_values
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, eroded
+from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray, IntArray
@@ -69,19 +71,22 @@ Light = Callable[[ImagePair, Mesh, FloatArray], ImagePair]
 
 
 class StateObservation(Protocol):
-    """What is known of one state apart from force and strain."""
+    """What is known of one state apart from force and strain; by default, nothing to share."""
 
     def prepare(self, level: Level, state: ModelState) -> None:
         """Have the data of a level, weighted as the model's state asks for."""
+        return
 
     def weigh_by_reference(self) -> None:
         """Let slopes weigh the residual whose noise has nothing to do with its own."""
+        return
 
     def equations(self, state: ModelState) -> StateEquations:
         """The share of the normal equations at the model's state."""
 
     def shared(self, state: ModelState, other: ModelState) -> FloatArray:
         """(k, k) products of slopes of this state and of another one in the same reference."""
+        return np.zeros((len(state.displacement_by),) * 2)
 
 
 class ImageData:
@@ -90,13 +95,18 @@ class ImageData:
     pixels : of the model's mesh where it is at first.
     noise : of the two; by default that of the reference there, estimated, in both.
     light : what makes g(x + u) as bright as f, before each level; None for images of one light.
+    lens : that both were taken through. Points are put where it shows them: in resampled images
+        noise and slopes would hang together.
     """
 
     def __init__(
         self, pair: ImagePair, pixels: MeshPixels, noise: ImageNoise | None = None,
-        light: Light | None = None,
+        light: Light | None = None, lens: Distortion | None = None,
     ) -> None:  # fmt: skip
-        self._given = pair
+        self._given, self._lens = pair, lens
+        if lens is not None:
+            shown, _ = through_lens(pixels.mesh.nodes, lens, pair.grid)
+            pixels = MeshPixels(replace(pixels.mesh, nodes=shown))
         self._sort(pixels)
         estimate = estimated_noise(pair.reference, self.pair.masks[0]).sd
         self.noise, self._light = noise or ImageNoise.of(estimate), light
@@ -112,6 +122,7 @@ class ImageData:
 
     def prepare(self, level: Level, state: ModelState) -> None:
         """Images of a level; on a coarse one what the residual is weighs it, not its noise."""
+        state = self._shown(state)
         if not np.array_equal(state.mesh.nodes, self.pixels.mesh.nodes):
             self._sort(MeshPixels(state.mesh))
         order, mesh, pair = self.order if level == FULL else 5, self.pixels.mesh, self.pair
@@ -166,6 +177,18 @@ class ImageData:
         """
         self._own = self._own._replace(slope=self._slope)
 
+    def _shown(self, state: ModelState) -> ModelState:
+        """A state as the lens shows it."""
+        if self._lens is None:
+            return state
+        X, grid = state.mesh.nodes, self._given.grid
+        nodes, _ = through_lens(X, self._lens, grid)
+        x, slopes = through_lens(X + state.displacement, self._lens, grid)
+        return replace(
+            state, mesh=replace(state.mesh, nodes=nodes), displacement=x - nodes,
+            displacement_by=np.einsum("nij,knj->kni", slopes, state.displacement_by),
+        )  # fmt: skip
+
     def _deformation(self, state: ModelState) -> FloatArray:
         """(m, 2, 2) mean deformation gradient of the elements of the pixels' mesh."""
         mesh = self.pixels.mesh
@@ -178,6 +201,7 @@ class ImageData:
 
     def equations(self, state: ModelState) -> StateEquations:
         """Projected from those of the nodes' displacements."""
+        state = self._shown(state)
         nodal, cells, by = self._nodal(state), self.pixels.mesh.cells, state.displacement_by
         blocks = np.zeros((self.block.max() + 1, len(by)))
         for some, S in _chunks(by, cells):
@@ -192,12 +216,14 @@ class ImageData:
 
     def shared(self, state: ModelState, other: ModelState) -> FloatArray:
         """(k, k) sums of the slopes along a state's fields times those along them in another."""
+        state, other = self._shown(state), self._shown(other)
         pulled = self._deformation(state) @ np.linalg.inv(self._deformation(other))  # slopes: F^-T
         squares = np.einsum("mijab,mjl->milab", _square(self._nodal(state)), pulled)
         return _products(state.displacement_by, self.pixels.mesh.cells, squares)
 
     def residual(self, state: ModelState) -> FloatArray:
         """(rows, cols) f - g(x + u) [grey levels] of the pixels compared; NaN elsewhere."""
+        state = self._shown(state)
         own, mesh = self._own, self.pixels.mesh
         found = np.full(self._images.grid.shape, np.nan)
         element = np.repeat(np.arange(len(mesh.cells)), np.diff(own.start))
@@ -209,7 +235,7 @@ class ImageData:
         return found
 
 
-class FieldData:
+class FieldData(StateObservation):
     """Displacements of a state at points, by any code.
 
     points, u : (p, 2) in the reference's frame [mm]; points beside the mesh are left out.
@@ -233,16 +259,6 @@ class FieldData:
         element, xi = located(mesh, self._points, beside=True)
         self._mesh, self._nodes = mesh, mesh.cells[element]
         self._N = shape_functions(mesh.element, xi)
-
-    def prepare(self, level: Level, state: ModelState) -> None:
-        """Nothing: displacements have no levels."""
-
-    def weigh_by_reference(self) -> None:
-        """Nothing: displacements have no slopes."""
-
-    def shared(self, state: ModelState, other: ModelState) -> FloatArray:
-        """Nothing: displacements have no reference."""
-        return np.zeros((len(state.displacement_by),) * 2)
 
     def equations(self, state: ModelState) -> StateEquations:
         """By differences of displacements at the points."""
@@ -308,6 +324,16 @@ def rigidly_moved(
     R, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
     shifts = np.broadcast_to(np.eye(2)[:, None], (2, *points.shape))
     return points @ R.T + motion[:2], np.concatenate([by @ R.T, shifts, [points @ slope.T]])
+
+
+def through_lens(
+    points: FloatArray, lens: Distortion, grid: PixelGrid
+) -> tuple[FloatArray, FloatArray]:
+    """Where a lens shows points (n, 2) [mm], and the derivatives of that (n, 2, 2)."""
+    at = grid.to_px(*points.T)
+    (rr, rc), (cr, cc) = lens.gradient(*at)
+    shown = np.column_stack(grid.to_mm(*lens.observed(*at)))
+    return shown, np.moveaxis(np.array([[1.0 + cc, -cr], [-rc, 1.0 + rr]]), 2, 0)
 
 
 def displacement_at(state: ModelState, nodes: FloatArray) -> FloatArray:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.identify import Identified
 from modeharvest.idic.finite_element.observed import ImageData, StateObservation
 from modeharvest.report.figures.boundaries import MeshBoundary
@@ -35,14 +34,11 @@ _HOLES_SHOWN = 0.15  # of a diameter: as which the largest change of a hole is d
 
 
 def identification_report(
-    summary: Summary,
-    found: Identified | None = None,
-    mesh: Mesh | None = None,
-    data: Sequence[StateObservation | None] = (),
+    summary: Summary, found: Identified | None = None, data: Sequence[StateObservation | None] = ()
 ) -> Report:
     """The report of an identification.
 
-    ``summary``: the content of ``summary.json``. ``found``, ``mesh``, ``data``: what its residual
+    ``summary``: the content of ``summary.json``. ``found``, ``data``: what its residual
     images show; without, the report has numbers only, as for the terminal.
     """
     parameters = summary["parameters"]
@@ -74,15 +70,14 @@ def identification_report(
                 *_hole_cards(summary),
             ]),
             Section.of("identified-states", [
-                *_force_cards(summary, mesh), *_residual_cards(found, mesh, data),
+                *_force_cards(summary, found), *_residual_cards(found, data),
                 *Card.tabular(states, wide=True),
             ]),
         ],
         warnings=summary["warnings"],
         command=summary["command"],
         case=summary["case"],
-        files={"solution.h5": "the model's states (HDF5)",
-               "solution.vtu": "the same for ParaView"},
+        files={"solution.h5": "the model's states (HDF5)", "solution.vtu": "the same for ParaView"},
         costs={"evaluations of the model": number(summary["evaluations"]),
                "its unknowns": number(summary["model_unknowns"])},
         versions=summary["versions"],
@@ -103,10 +98,8 @@ def _row(p: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _law_row(law: Mapping[str, Any]) -> Mapping[str, Any]:
-    values = [
-        f"{p['name']} {Measured(p['value'], (p['sd_with_model_error'] or np.nan,))}"
-        for p in law["parameters"]
-    ]
+    values = [f"{p['name']} {Measured(p['value'], (p['sd_with_model_error'] or np.nan,))}"
+              for p in law["parameters"]]  # fmt: skip
     tests = {name: _TEST.format(**law[name]) for name in ("model_error", "law_error")}
     return {**law, **tests, "parameters": ", ".join(values)}
 
@@ -123,8 +116,8 @@ def _state_row(state: Mapping[str, Any]) -> Mapping[str, Any]:
     }
 
 
-def _force_cards(summary: Summary, mesh: Mesh | None) -> list[Card]:
-    if mesh is None:
+def _force_cards(summary: Summary, found: Identified | None) -> list[Card]:
+    if found is None:
         return []
     draw = partial(_draw_force, summary["states"], summary["force_sd_N_per_mm"])
     figure = ReportFigure("force", "", draw)
@@ -176,14 +169,14 @@ def _draw_holes(holes: Sequence[Mapping[str, Any]], times: float) -> Figure:
 
 
 def _residual_cards(
-    found: Identified | None, mesh: Mesh | None, data: Sequence[StateObservation | None]
+    found: Identified | None, data: Sequence[StateObservation | None]
 ) -> list[Card]:
-    if found is None or mesh is None:
+    if found is None:
         return []
     figures = []
     for k, (state, part) in enumerate(zip(found.states, data, strict=False), start=1):
         if isinstance(part, ImageData):
-            frame = MapFrame.of(MeshBoundary.of(mesh), part.pair.grid)
+            frame = MapFrame.of(MeshBoundary.of(part.pixels.mesh), part.pair.grid)
             field = frame.average(part.residual(state))
             draw = partial(draw_field, frame, field, ColourScale.signed(field, "levels", 0.999))
             figures.append(ReportFigure(f"residual-{k}", f"{100 * state.strain:.4g} %", draw))

@@ -42,8 +42,8 @@ class MeasuredData:
     """Of the polynomials by which gain and offset of the light differ between images; None where
     they don't."""
     distortion: str = ""
-    """Of the lens: a file of modeharvest (JSON) or of a calibration program; images are freed from
-    it."""
+    """Of the lens: a file of modeharvest (JSON) or of a calibration program; images stay
+    as they are, and points are put where it shows them."""
     noise_sd: float | None = None
     """Of the camera, in each image [grey levels of the files]; else estimated from the images."""
     fields: tuple[str, ...] = ()
@@ -70,31 +70,28 @@ class MeasuredData:
         if self.critical_strain and not 0.0 < self.critical_strain[0] < self.critical_strain[1]:
             got = [*self.critical_strain]
             raise InputError(f"data: expected critical_strain = [low, high] above 0, got {got}")
-        if bool(self.fields) == bool(self.reference or self.deformed):
-            raise InputError(
-                "data: expected images (reference and deformed) or fields, got "
-                f"{'both' if self.fields else 'neither'}"
-            )
-        if bool(self.reference) != bool(self.deformed):
-            raise InputError("data: expected a reference and deformed images, got one of the two")
-        if self.reference and self.pixel_size is None:
-            raise InputError("data: expected a pixel_size [mm/px] for images, got none")
-        if self.fields and self.field_sd_mm is None:
-            raise InputError("data: expected field_sd_mm for displacement fields, got none")
-        if self.forces_N and self.forces_N_per_mm:
-            raise InputError("data: expected forces_N or forces_N_per_mm, got both")
-        if self.forces_N and self.thickness_mm is None:
-            raise InputError("data: expected thickness_mm with forces_N, got none")
-        if (self.forces_N or self.forces_N_per_mm) and self.force_sd is None:
-            raise InputError("data: expected force_sd with forces, got none")
+        images, forces = self.reference or self.deformed, self.forces_N or self.forces_N_per_mm
+        for is_wrong, text in (
+            (bool(images) == bool(self.fields), "images (reference and deformed) or fields, got "
+             f"{'both' if images else 'neither'}"),
+            (bool(self.reference) != bool(self.deformed),
+             "a reference and deformed images, got one of the two"),
+            (images and self.pixel_size is None, "a pixel_size [mm/px] for images, got none"),
+            (self.fields and self.field_sd_mm is None,
+             "field_sd_mm for displacement fields, got none"),
+            (self.forces_N and self.forces_N_per_mm, "forces_N or forces_N_per_mm, got both"),
+            (self.forces_N and self.thickness_mm is None, "thickness_mm with forces_N, got none"),
+            (forces and self.force_sd is None, "force_sd with forces, got none"),
+            (self.distortion and not images, "images for the distortion of a lens, got fields"),
+        ):  # fmt: skip
+            if is_wrong:
+                raise InputError(f"data: expected {text}")
         for name in ("pixel_size", "noise_sd", "field_sd_mm", "thickness_mm", "force_sd"):
             if (value := getattr(self, name)) is not None:
                 require_within(f"data: expected {name}", value, 0.0, above=True)
         require_within("data: expected strain_sd", self.strain_sd, 0.0, above=True)
         if self.light_degree is not None:
             require_within("data: expected light_degree", self.light_degree, 0, 6)
-        if self.distortion and not self.reference:
-            raise InputError("data: expected images for the distortion of a lens, got fields")
 
     @property
     def forces(self) -> Readings | None:
@@ -208,9 +205,8 @@ class IdentificationCase(CaseModel):
         if self.data is not None:
             for name in ("forces_N", "forces_N_per_mm"):
                 if (got := len(getattr(self.data, name))) not in (0, strains):
-                    raise InputError(
-                        f"data: expected as many {name} as strains ({strains}), got {got}"
-                    )
+                    what = f"as many {name} as strains ({strains})"
+                    raise InputError(f"data: expected {what}, got {got}")
         return self
 
     def with_law(self, law: OtherLaw) -> IdentificationCase:

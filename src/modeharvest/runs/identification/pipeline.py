@@ -47,7 +47,7 @@ from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.idic.uncertainty.parameters import compared_by_evidence
 from modeharvest.imaging.distortion.files import read_distortion
-from modeharvest.imaging.distortion.lens import undistorted
+from modeharvest.imaging.distortion.lens import Distortion, undistorted
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
@@ -56,13 +56,13 @@ from modeharvest.runs.case import checked
 from modeharvest.runs.identification.case import IdentificationCase, MeasuredData, TwinTruth
 from modeharvest.runs.identification.placement import found_place
 from modeharvest.runs.photographs.sequence import named_files
-from modeharvest.util.arrays import FloatArray, FloatImage
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, sha256_of, write_json
 from modeharvest.util.stages import StagedRun, exclusive, stage_key, versions
 from modeharvest.util.typed import to_plain
 
-_FRAME = {"centre": (0.02, "mm"), "orientation": (0.02, "rad"),
+_FRAME = {"centre": (0.005, "mm"), "orientation": (0.005, "rad"),
           "shift": (0.1, "mm"), "turn": (0.1, "rad")}  # fmt: skip
 """How far unknowns of the camera's frame may be off where they start, lengths over the specimen's,
 and their units."""
@@ -170,8 +170,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         data += [None] * (len(self._strains.values) - len(data))  # the critical state
         found, model, choices = self._best(self.case, data, *given)
         laws, comparison = self._laws(found, data, *given)
-        mesh = found.states[0].mesh
-        solution = Solution(mesh, tuple(
+        solution = Solution(found.states[0].mesh, tuple(
             Snapshot(s.strain, s.displacement, s.force, negative_pivots=s.negative_pivots,
                      branch=s.branch) for s in found.states[: len(experiment.strains)]
         ), {"specimen": experiment.specimen.plain()})  # fmt: skip
@@ -188,7 +187,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         from modeharvest.report.identification import identification_report
         from modeharvest.report.model import write_page
 
-        write_page(identification_report(summary, found, mesh, data), page, self.progress)
+        write_page(identification_report(summary, found, data), page, self.progress)
         write_json(path, summary)
         return [h5, vtu, page, path]
 
@@ -292,7 +291,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             px, given = data.field_sd_mm, self._given
             found: list[Any] = [FieldData(f.points[f.good], f.u[f.good], px, mesh) for f in given]
         else:
-            pairs, place = self._photographed(data)
+            pairs, place, lens = self._photographed(data)
             if place is not None:
                 start = dict(zip(PLACE, place, strict=True)) | start
                 none = np.zeros((0, *mesh.nodes.shape))
@@ -300,7 +299,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             noise = None if data.noise_sd is None else ImageNoise.of(data.noise_sd)
             pixels, degree = MeshPixels(mesh), data.light_degree
             light = None if degree is None else partial(alike, degree=degree)
-            found = [ImageData(pair, pixels, noise, light) for pair in pairs]
+            found = [ImageData(pair, pixels, noise, light, lens) for pair in pairs]
             px = pairs[0].grid.pixel_size
         length, frame = float(np.ptp(mesh.nodes[:, 0])), dict[str, Unknown]()
         for name, value in start.items():
@@ -318,37 +317,32 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         frames = data.critical_strain if data else read_json(path).get("critical_strain")
         if frames is None:
             return Readings(e, sds)
-        return Readings(
-            np.append(e, np.mean(frames)), np.append(sds, np.ptp(frames) / np.sqrt(12.0))
-        )
+        sd = np.ptp(frames) / np.sqrt(12.0)
+        return Readings(np.append(e, np.mean(frames)), np.append(sds, sd))
 
     def _exposed(self, images: ImageSet, mesh: Mesh) -> Iterator[ImageData]:
-        """The images of a twin, freed from what its lens is known to do."""
-        lens = self.case.imaging.lens(images.grid.shape)
+        """The images of a twin, through a lens that is known."""
+        lens, grid = self.case.imaging.lens(images.grid.shape), images.grid
         light = partial(alike, degree=0) if self.case.imaging.sensor.flicker else None
-        pixels = MeshPixels(mesh)
-
-        def freed(image: FloatImage) -> FloatImage:
-            return image if lens is None else undistorted(image, lens)
-
-        reference = freed(images.reference(camera=True))
+        reference, pixels = images.reference(camera=True), MeshPixels(mesh)
         for e in images.strains:
             at = ((None, images.mask()), (e, images.deformed_mask(e)))
             sds = [float(images.noise_sd(which)[where].mean()) for which, where in at]
-            pair = ImagePair(reference, freed(images.deformed(e, camera=True)), images.grid)
-            yield ImageData(pair, pixels, ImageNoise(*sds), light)
+            pair = ImagePair(reference, images.deformed(e, camera=True), grid)
+            yield ImageData(pair, pixels, ImageNoise(*sds), light, lens)
 
-    def _photographed(self, data: MeasuredData) -> tuple[list[ImagePair], FloatArray | None]:
-        """The images of the files, and where the reference shows the specimen."""
+    def _photographed(
+        self, data: MeasuredData
+    ) -> tuple[list[ImagePair], FloatArray | None, Distortion | None]:
+        """The images of the files, where the reference shows the specimen, and the lens."""
         reference = read_reference(self._files[0])
-        frames = [reference.image, *(read_frame(path, reference).image for path in self._files[1:])]
-        for path in self._lens:
-            lens = read_distortion(path)
-            frames = [undistorted(frame, lens) for frame in frames]
-        (first, *others), specimen = frames, self.case.experiment.specimen
+        others = [read_frame(path, reference).image for path in self._files[1:]]
+        lens = next(map(read_distortion, self._lens), None)
+        first = reference.image if lens is None else undistorted(reference.image, lens)
         grid = PixelGrid.centred(*reference.shape, data.pixel_size or 1.0)
+        specimen = self.case.experiment.specimen
         place = None if data.placement == "centred" else found_place(first, grid, specimen)
-        return [ImagePair(first, other, grid) for other in others], place
+        return [ImagePair(reference.image, other, grid) for other in others], place, lens
 
     def _holes(self, found: Identified) -> tuple[list[dict[str, Any]] | None, dict[str, Any]]:
         """The holes as found, if they are unknown; and true values of a twin's unknowns."""
@@ -394,14 +388,13 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     def _summary(self, found: Identified, model: Any) -> dict[str, Any]:
         case, forces, (holes, true) = self.case, found.forces, self._holes(found)
-        rows = zip(found.unknowns, found.unknowns.values(), found.values, found.sd,
-                   found.sd_with_model_error, found.mesh_error, strict=True)  # fmt: skip
         parameters = [
-            {"name": name, "unit": self._unit(name),
-             "start": unknown.start, "bounds": unknown.bounds, "value": value, "sd": sd,
-             "sd_with_model_error": sd_model, "mesh_error": off,
-             "true": true.get(name)}
-            for name, unknown, value, sd, sd_model, off in rows
+            {"name": name, "unit": self._unit(name), "start": unknown.start,
+             "bounds": unknown.bounds, "value": value, "sd": sd, "sd_with_model_error": sd_model,
+             "mesh_error": off, "true": true.get(name)}
+            for (name, unknown), value, sd, sd_model, off in zip(
+                found.unknowns.items(), found.values, found.sd, found.sd_with_model_error,
+                found.mesh_error, strict=True)
         ]  # fmt: skip
         readings = [np.nan] * len(found.states) if forces is None else forces.values
         of_states = zip(found.states, found.force_sd, readings, found.state_equations, strict=False)
@@ -450,10 +443,8 @@ def _path_warnings(model: Any, values: FloatArray) -> list[str]:
     off = max(float(np.abs(a.displacement - b.displacement).max()) for a, b in pairs)
     if off < _SAME_MM:
         return []
-    return [
-        f"The states were found step by step, and are up to {off:.2g} mm off those that the whole "
-        "path of the same parameters leads to: they may be on another branch."
-    ]
+    return [f"The states were found step by step, up to {off:.2g} mm off those of the whole "
+            "path with the same parameters: they may be on another branch."]  # fmt: skip
 
 
 def _surface_warnings(state: Any) -> list[str]:
