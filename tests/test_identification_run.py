@@ -360,6 +360,8 @@ def test_the_shipped_case_is_one() -> None:
         ({"unknowns": {}}, "expected at least one, got none"),
         ({"unknowns": {"kappa": {"start": 1.0, "bounds": [2.0, 3.0]}}},
          "start between them, got a start of 1 and bounds of [2, 3]"),
+        ({"unknowns": {"kappa": {"start": 1.0, "bounds": [-2.0, 3.0]}}},
+         "unknowns.kappa: expected bounds of 0 or more, got -2.0"),
         ({"unknowns": {"kappa": {"start": 1.0}}}, "expected unknowns.kappa.bounds, got none"),
         ({"experiment": {"strains": [0.05, 0.03]}}, "expected ascending positive ones"),
         ({"data": {"reference": "f.tif", "deformed": ["g.tif", "h.tif"]}},

@@ -313,7 +313,7 @@ class ParametricTest:
             if state is None:
                 raise InputError(
                     f"expected an equilibrium at a nominal strain of {100 * e:.4g} % on the "
-                    f"{branch} path, got none: the path of these parameters does not reach it"
+                    f"{branch} path, got none: it does not reach it; leave that strain out"
                 )
             found.append((state, branch))
         return found

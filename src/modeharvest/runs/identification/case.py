@@ -199,6 +199,8 @@ class IdentificationCase(CaseModel):
             raise InputError(f"laws: expected names that differ, got {names}")
         for name in (*self.unknowns, *(self.twin.values if self.twin is not None else ())):
             parameter(name, self.experiment)
+        for name in {"kappa", "bulk", "c1", TRAVEL} & self.unknowns.keys():
+            require_within(f"unknowns.{name}: expected bounds", self.unknowns[name].bounds[0], 0.0)
         if (self.data is None) == (self.twin is None):
             raise InputError("expected a table [data] or a table [twin], got both or neither")
         strains = len(self.experiment.strains)
@@ -214,8 +216,7 @@ class IdentificationCase(CaseModel):
         own = vars(self.experiment.material)
         rest = {n: u for n, u in self.unknowns.items() if n.partition("[")[0] not in own}
         experiment = replace(self.experiment, material=law.material)
-        update = {"experiment": experiment, "unknowns": law.unknowns | rest}
-        return self.model_copy(update=update)
+        return self.model_copy(update={"experiment": experiment, "unknowns": law.unknowns | rest})
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, materials by their kind."""
