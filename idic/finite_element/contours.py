@@ -16,6 +16,8 @@ Contours don't show whether it does; what sliding would change counts in the sta
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
+from functools import partial
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -32,7 +34,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.contour import Contour, SeenContours
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.progress import Progress, counted, silent
+from modeharvest.util.progress import Progress, silent
 
 ELASTOMER = Ogden(moduli=(2.0,), exponents=(2.0,), kappa=9.0)
 """Neo-Hookean, Poisson's ratio 0.45: what is assumed of a body whose law isn't known."""
@@ -266,15 +268,13 @@ class _PenalisedBody:
 
     def change_by(self, law: Material | None = None, slides: bool = False) -> FloatArray:
         """(n, 2) by how much another law, or edges that slide, would change u [mm], about."""
-        kept = self.law, self.shear, self.plates, self.stretched
+        other = copy(self)
         if law is not None:
-            self._use(law)
+            other._use(law)
         if slides:
-            self.plates, self.stretched = self.plates[:0], self.stretched[:0]
-        A, _, forces = self.linearised()
-        step = self.factor(A).solve(-forces)
-        self.law, self.shear, self.plates, self.stretched = kept
-        return step.reshape(-1, 2)
+            other.plates, other.stretched = self.plates[:0], self.stretched[:0]
+        A, _, forces = other.linearised()
+        return self.factor(A).solve(-forces).reshape(-1, 2)
 
 
 def displacement_from_contours(
@@ -302,18 +302,18 @@ def displacement_from_contours(
     """
     state = _PenalisedBody(body, seen, grid, law or ELASTOMER, start)
     soft, stiff = _SPRINGS
-    sides, before, converged = tuple[IntArray, ...](), state.u, False
-    for stage in counted(range(3), progress, "displacement from contours"):
-        if stage == 0:
-            state.relax(soft, _ROUGH_PX)
-            sides = state.pressed_sides()
-            state.press(sides, slides=slides)
-        elif stage == 1:
-            state.relax(soft, 10.0 * _TOLERANCE_PX)
-            before = state.u
-        else:
-            state.take_up(stiff / soft)
-            converged = state.relax(stiff, _TOLERANCE_PX)
+    step = partial(progress, total=3, what="displacement from contours")
+    step(0)
+    state.relax(soft, _ROUGH_PX)
+    sides = state.pressed_sides()
+    state.press(sides, slides=slides)
+    step(1)
+    state.relax(soft, 10.0 * _TOLERANCE_PX)
+    before = state.u
+    step(2)
+    state.take_up(stiff / soft)
+    converged = state.relax(stiff, _TOLERANCE_PX)
+    step(3)
     u, mesh = state.u.reshape(-1, 2), body.mesh
     left = np.asarray(state.u - before).reshape(-1, 2) * (soft / (stiff - soft))
     sd, known = _deviations(state, seen.noise, law is None, bool(sides) and not slides, left)

@@ -20,6 +20,7 @@ from skimage import measure
 from modeharvest.fem.field import Mesh, with_mid_sides
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.bernstein import non_positive_jacobians, require_positive_jacobian
+from modeharvest.imaging.photographs.contour import signed_area
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.masks import large_parts, opened
@@ -222,8 +223,7 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
     loops: dict[int, list[tuple[float, FloatArray]]] = {}
     for contour in find_contours(blurred, 0.5):
         points = np.stack([contour[-2::-1, 1], -contour[-2::-1, 0]], axis=1)
-        along = np.roll(points, -1, axis=0)
-        area = 0.5 * float(np.sum(points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
+        area = signed_area(points)
         row, col = np.rint(contour[0]).astype(int)
         island = int(islands[tuple(nearest[:, row, col])])
         # Of material inside a contour the signed area is positive, x right and y up.

@@ -29,7 +29,7 @@ from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.imaging.photographs.contour import Contour, HoleShape, SeenContours
+from modeharvest.imaging.photographs.contour import Contour, HoleShape, SeenContours, signed_area
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic
@@ -150,9 +150,9 @@ def _contours(signed: FloatArray, material: BoolArray) -> tuple[FloatArray, ...]
         row, col = np.rint(points[len(points) // 2]).astype(int)
         around = np.s_[max(0, row - 2) : row + 3, max(0, col - 2) : col + 3]
         closed = len(points) > 8 and np.allclose(points[0], points[-1])
-        if closed and material[around].any() and abs(_area(points)) > _LEAST_PX2:
+        if closed and material[around].any() and abs(signed_area(points)) > _LEAST_PX2:
             found.append(points[:-1])
-    return tuple(sorted(found, key=lambda points: -abs(_area(points))))
+    return tuple(sorted(found, key=lambda points: -abs(signed_area(points))))
 
 
 def _one_specimen(material: BoolArray, like: BoolArray | None) -> tuple[BoolArray, tuple[str, ...]]:
@@ -218,11 +218,6 @@ def _slope(grey: FloatImage, contours: Sequence[FloatArray]) -> float:
     row, col = np.rint(np.vstack(contours)).astype(int).T
     slopes = [part[row, col] for part in np.gradient(grey)]
     return float(np.median(np.hypot(*slopes)))
-
-
-def _area(points: FloatArray) -> float:
-    after = np.roll(points, -1, axis=0)
-    return 0.5 * float(np.sum(points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]))
 
 
 @dataclass(frozen=True, eq=False)

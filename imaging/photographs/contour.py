@@ -15,6 +15,12 @@ _FINE_PX = 0.25
 """Between the points of a contour among which the nearest is sought."""
 
 
+def signed_area(points: FloatArray) -> float:
+    """Of a polygon (n, 2): positive where x, y go around it anticlockwise."""
+    after = np.roll(points, -1, axis=0)
+    return 0.5 * float(np.sum(points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]))
+
+
 class Contour:
     """A closed smooth curve through points (n, 2) [mm], each once."""
 
@@ -38,7 +44,7 @@ class Contour:
         """Signed area [mm^2], centroid (2,) [mm], second central moments (2, 2) over it [mm^2]."""
         p, q = self.points, np.roll(self.points, -1, axis=0)
         cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-        area = 0.5 * float(cross.sum())
+        area = signed_area(p)
         centre = (p + q).T @ cross / (6.0 * area)
         a, b = p - centre, q - centre
         around = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
