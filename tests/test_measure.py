@@ -181,6 +181,18 @@ def test_other_files_say_the_same(result: NodalResult, measured: Path, tmp_path:
     assert np.isnan(table[1, 4:]).all()  # in the hole
 
 
+def test_an_empty_file_in_a_folder_is_skipped_and_the_rest_goes_on(
+    plate: Plate, tmp_path: Path
+) -> None:
+    (tmp_path / "shots").mkdir()
+    (tmp_path / "shots/a.tif").write_bytes((plate.folder / "a.tif").read_bytes())
+    (tmp_path / "shots/b.tif").touch()
+    summary = measure(plate.folder / "ref.tif", [tmp_path / "shots"], tmp_path / "out")
+    (image,), (skipped,) = summary["images"], summary["skipped"]
+    assert (image["name"], skipped["name"]) == ("a", "b")
+    assert "an empty file, cut short at 0 bytes" in skipped["reason"]
+
+
 def test_material_is_found_and_lengths_are_pixels(plate: Plate, tmp_path: Path) -> None:
     summary = measure(plate.folder / "ref.tif", [plate.folder / "a.tif"], tmp_path)
     (image,) = summary["images"]
