@@ -152,13 +152,14 @@ def plate_mesh() -> Mesh:
     return Mesh(block.nodes + np.array([-1.1, 0.38]), block.cells, "T6")
 
 
+@pytest.mark.parametrize("block", [1, 2])
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_factor_solves_and_takes_new_values(library: str) -> None:
+def test_factor_solves_and_takes_new_values(library: str, block: int) -> None:
     pytest.importorskip({"mumps": "petsc4py", "superlu": "scipy"}[library])
     n = 40
     matrix = csr_array(diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(n, n)))
     matrix.sort_indices()
-    factor = factorise(matrix, library)
+    factor = factorise(matrix, library, block=block)
     right = np.random.default_rng(0).standard_normal((n, 3))
     np.testing.assert_allclose(matrix @ factor.solve(right), right, atol=1e-12)
     factor.update(2.0 * matrix)

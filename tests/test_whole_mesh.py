@@ -54,7 +54,8 @@ def test_islands_are_bodies_and_specks_are_left_out() -> None:
     mask[10:14, 200:204] = True  # a speck
     mask[150:154, 160:164] = False  # dirt
     assert sorted(len(part) for part in boundaries(mask, 12.0)) == [1, 2]
-    kept, changes = meshable(mask, 12.0)
+    kept, narrowest, changes = meshable(mask, 12.0)
+    assert narrowest == pytest.approx(30.0, abs=1.0)  # between the first one's hole and its edge
     assert [text.split(" ")[0] for text in changes] == ["Holes", "1"]
     assert "16 px at row 10, column 200" in changes[1]
     mask[10:14, 200:204], mask[150:154, 160:164] = False, True

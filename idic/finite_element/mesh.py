@@ -28,6 +28,8 @@ from modeharvest.util.masks import large_parts, opened
 find_contours: Any = measure.find_contours
 
 _BLUR_PX = 1.5
+_NEAR_PX = 8
+"""Material that makes a blurred mask exceed one half somewhere is nearer."""
 _WINDOW_PX = 41
 """Cubics are fitted to that much of a contour: a pixel's edge is smoothed away, no curvature."""
 _ROUNDED_PX = 4
@@ -68,11 +70,11 @@ class MeshedMaterial(NamedTuple):
     """What of the mask was left out or filled, in sentences."""
 
 
-def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, ...]]:
+def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, float, tuple[str, ...]]:
     """Fill the holes, and leave out islands and ligaments, that elements of so many px don't fit.
 
-    Returns the mask of what is left, and what was changed, in sentences; ``element_px``: edge
-    length along edges [px].
+    Returns the mask of what is left, its width where it is narrowest [px], and what was changed, in
+    sentences; ``element_px``: edge length along edges [px].
     """
     changes = []
     kept = mask | ~large_parts(~mask, _LEAST_HOLE * element_px**2)
@@ -82,11 +84,12 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, 
             f"Holes in the mask smaller than {_LEAST_HOLE * element_px**2:.0f} px were filled, "
             f"{filled} px in all."
         )
-    wide = kept
+    wide, narrowest = kept, _narrowest(kept)
     for radius in _OPENINGS_PX:
-        if _narrowest(wide) >= _NARROWEST_PX:
+        if narrowest >= _NARROWEST_PX:
             break
         wide = opened(kept, radius, at_border=True)
+        narrowest = _narrowest(wide)
     if wide is not kept:
         changes.append(
             f"Material narrower than {2.0 * radius:g} px was left out, "
@@ -105,8 +108,8 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, tuple[str, 
             f"{'was' if count == 1 else 'were'} left out: {'; '.join(where)}"
             f"{'; ...' if count > len(where) else ''}."
         )
-        kept = large
-    return kept, tuple(changes)
+        kept, narrowest = large, _narrowest(large)
+    return kept, narrowest, tuple(changes)
 
 
 def mesh_of_mask(
@@ -121,9 +124,9 @@ def mesh_of_mask(
             "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
             "mesh"
         )
-    kept, changes = meshable(mask, edge_element_px)
+    kept, narrowest, changes = meshable(mask, edge_element_px)
     # Elements longer than a ligament is wide would make chords of its two edges cross.
-    edge = min(edge_element_px, _narrowest(kept))
+    edge = min(edge_element_px, narrowest)
     if edge < _NARROWEST_PX:
         raise InputError(
             f"expected material at least {_NARROWEST_PX:g} px wide between holes, got {edge:.1f} "
@@ -218,14 +221,11 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
     inside = np.pad(mask, 8)
     islands = ndimage.label(inside)[0]
     blurred = ndimage.gaussian_filter(inside.astype(np.float32), _BLUR_PX)
-    # Where both sides are the same island a blur must not close a slit, nor join two islands.
-    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
     loops: dict[int, list[tuple[float, FloatArray]]] = {}
     for contour in find_contours(blurred, 0.5):
         points = np.stack([contour[-2::-1, 1], -contour[-2::-1, 0]], axis=1)
         area = signed_area(points)
-        row, col = np.rint(contour[0]).astype(int)
-        island = int(islands[tuple(nearest[:, row, col])])
+        island = _island_at(islands, *contour[0])
         # Of material inside a contour the signed area is positive, x right and y up.
         if abs(area) < (_LEAST_ISLAND if area > 0.0 else _LEAST_HOLE) * element_px**2:
             continue
@@ -238,6 +238,15 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
         others = [loop for loop in found if loop is not outer]
         parts.append(tuple(_smooth(points, element_px) for _, points in (outer, *others)))
     return tuple(parts)
+
+
+def _island_at(islands: IntArray, row: float, col: float) -> int:
+    """Label of the material's pixel nearest to a point of a contour, which is close by."""
+    top, left = max(0, int(row) - _NEAR_PX), max(0, int(col) - _NEAR_PX)
+    around = islands[top : top + 2 * _NEAR_PX, left : left + 2 * _NEAR_PX]
+    rows, cols = np.nonzero(around)
+    k = int(np.argmin((rows + top - row) ** 2 + (cols + left - col) ** 2))
+    return int(around[rows[k], cols[k]])
 
 
 def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:

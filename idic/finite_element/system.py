@@ -207,7 +207,7 @@ class Body:
             A = csr_array(M + weight * R)
             A.sort_indices()
         if self._factor is None or self._stored != A.nnz:
-            self._factor, self._stored = factorise(A), A.nnz
+            self._factor, self._stored = factorise(A, block=2), A.nnz
         else:
             self._factor.update(A)
         self._factorised = M, R, weight
