@@ -21,14 +21,12 @@ def factorise(
 ) -> Factor:
     """Factorise a symmetric matrix, of sorted indices.
 
-    ModuleNotFoundError if the library named isn't there. ArithmeticError if the matrix is singular,
-    here or in an update.
+    ModuleNotFoundError: the library named isn't there. ArithmeticError: singular, here or updated.
 
     matrix : (n, n), both triangles.
     library : a name among ``LIBRARIES``; by default MUMPS if it is there.
     definite : whether all matrices are known to be positive definite; else L D L^T, with pivoting.
-    block : how many unknowns a node has, one after another: MUMPS then orders nodes, in half the
-        time.
+    block : unknowns of a node, one after another: MUMPS then orders nodes, in half the time.
     """
     best = "mumps" if find_spec("petsc4py") else "superlu"
     return LIBRARIES[library or best](matrix, definite, block)
@@ -41,11 +39,9 @@ class _Mumps:
         from petsc4py import PETSc
 
         # The arrays are shared, so that new values need no call for each row.
-        self._arrays = (
-            matrix.indptr.astype(PETSc.IntType),
-            matrix.indices.astype(PETSc.IntType),
-            matrix.data.astype(PETSc.ScalarType),
-        )
+        kinds = PETSc.IntType, PETSc.IntType, PETSc.ScalarType
+        parts = matrix.indptr, matrix.indices, matrix.data
+        self._arrays = tuple(a.astype(kind) for a, kind in zip(parts, kinds, strict=True))
         shape = matrix.shape
         self._matrix = PETSc.Mat().createAIJWithArrays(shape, self._arrays, comm=PETSc.COMM_SELF)
         self._matrix.setOption(PETSc.Mat.Option.SPD, definite)
@@ -58,15 +54,14 @@ class _Mumps:
         self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
         self._factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
         self._factor.setMumpsIcntl(14, 60 if definite else 200)  # room for fill-in and pivoting [%]
-        self._factor.setMumpsIcntl(15, -block if block > 1 else 0)
+        self._factor.setMumpsIcntl(15, -block if block > 1 else 0)  # order blocks
         self.update(matrix)
 
     def update(self, matrix: csr_array) -> None:
         self._arrays[2][:] = matrix.data
         self._matrix.stateIncrease()
         self._pc.setUp()
-        code = self._factor.getMumpsInfog(1)
-        if code < 0:
+        if (code := self._factor.getMumpsInfog(1)) < 0:
             raise ArithmeticError(f"MUMPS failed with INFOG(1) = {code}")
 
     def solve(self, rhs: FloatArray) -> FloatArray:
