@@ -302,8 +302,7 @@ class _Measurement:
             rms = float(np.sqrt(np.mean(length**2)))
             if isinstance(self.prior, Imbalance) or rms > min(short, 0.5 * last):
                 self.kept = None
-            last = rms
-            if rms < stage.tolerance_px:
+            if (last := rms) < stage.tolerance_px:
                 break
 
     def regularise(self) -> None:
