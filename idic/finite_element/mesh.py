@@ -28,8 +28,6 @@ from modeharvest.util.masks import large_parts, opened
 find_contours: Any = measure.find_contours
 
 _BLUR_PX = 1.5
-_NEAR_PX = 8
-"""Material that makes a blurred mask exceed one half somewhere is nearer."""
 _WINDOW_PX = 41
 """Cubics are fitted to that much of a contour: a pixel's edge is smoothed away, no curvature."""
 _ROUNDED_PX = 4
@@ -73,8 +71,8 @@ class MeshedMaterial(NamedTuple):
 def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, float, tuple[str, ...]]:
     """Fill the holes, and leave out islands and ligaments, that elements of so many px don't fit.
 
-    Returns the mask of what is left, its width where it is narrowest [px], and what was changed, in
-    sentences; ``element_px``: edge length along edges [px].
+    Returns the mask of what is left, its least width [px], and what was changed, in sentences;
+    ``element_px``: edge length along edges [px].
     """
     changes = []
     kept = mask | ~large_parts(~mask, _LEAST_HOLE * element_px**2)
@@ -91,10 +89,8 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, float, tupl
         wide = opened(kept, radius, at_border=True)
         narrowest = _narrowest(wide)
     if wide is not kept:
-        changes.append(
-            f"Material narrower than {2.0 * radius:g} px was left out, "
-            f"{int((kept & ~wide).sum())} px in all."
-        )
+        lost = f"{int((kept & ~wide).sum())} px in all."
+        changes.append(f"Material narrower than {2.0 * radius:g} px was left out, {lost}")
         kept = wide
     least = _MARGIN * _LEAST_ISLAND * element_px**2
     large = large_parts(kept, least)
@@ -219,13 +215,17 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
     Islands and holes too small for such elements are left out; :func:`meshable` says which.
     """
     inside = np.pad(mask, 8)
-    islands = ndimage.label(inside)[0]
+    islands, count = ndimage.label(inside)
     blurred = ndimage.gaussian_filter(inside.astype(np.float32), _BLUR_PX)
+    # Where both sides are the same island a blur must not close a slit, nor join two islands.
+    if count > 1:
+        nearest = ndimage.distance_transform_edt(~inside, None, False, True)
     loops: dict[int, list[tuple[float, FloatArray]]] = {}
     for contour in find_contours(blurred, 0.5):
         points = np.stack([contour[-2::-1, 1], -contour[-2::-1, 0]], axis=1)
         area = signed_area(points)
-        island = _island_at(islands, *contour[0])
+        row, col = np.rint(contour[0]).astype(int)
+        island = 1 if count == 1 else int(islands[tuple(nearest[:, row, col])])
         # Of material inside a contour the signed area is positive, x right and y up.
         if abs(area) < (_LEAST_ISLAND if area > 0.0 else _LEAST_HOLE) * element_px**2:
             continue
@@ -238,15 +238,6 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
         others = [loop for loop in found if loop is not outer]
         parts.append(tuple(_smooth(points, element_px) for _, points in (outer, *others)))
     return tuple(parts)
-
-
-def _island_at(islands: IntArray, row: float, col: float) -> int:
-    """Label of the material's pixel nearest to a point of a contour, which is close by."""
-    top, left = max(0, int(row) - _NEAR_PX), max(0, int(col) - _NEAR_PX)
-    around = islands[top : top + 2 * _NEAR_PX, left : left + 2 * _NEAR_PX]
-    rows, cols = np.nonzero(around)
-    k = int(np.argmin((rows + top - row) ** 2 + (cols + left - col) ** 2))
-    return int(around[rows[k], cols[k]])
 
 
 def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
