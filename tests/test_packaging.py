@@ -143,3 +143,12 @@ def test_the_installed_version_is_the_package_s(installed: Path, tmp_path: Path)
 def test_the_installed_command_says_its_version(installed: Path, tmp_path: Path) -> None:
     command = installed.with_name("modeharvest")
     assert modeharvest.__version__ in run(command, "--version", cwd=tmp_path)
+
+
+def test_versions_agree() -> None:
+    version = modeharvest.__version__
+    citation = (PROJECT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    assert f"version: {version}" in citation
+    if (PROJECT / ".git").exists() and shutil.which("git"):  # a release is what its tag says
+        tags = run("git", "tag", "--points-at", "HEAD", "--list", "v*", cwd=PROJECT).split()
+        assert set(tags) <= {f"v{version}"}
