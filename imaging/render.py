@@ -75,7 +75,8 @@ class ImagedState:
         require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
         cells = mesh.cells[self._reaching(nodes, selected, float(np.abs(offsets).max(initial=0.0)))]
         position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)
-        place, pattern = polynomials(mesh.element, cells, position), self.speckle.spline.table
+        samples = self.speckle.spec.binary_field.finer * position  # of which the spline is
+        place, pattern = polynomials(mesh.element, cells, samples), self.speckle.spline.table
         selected = np.ascontiguousarray(selected)
         chosen = np.flatnonzero(selected)
         first = np.searchsorted(chosen, np.arange(0, grid.rows + _BAND, _BAND) * grid.cols)
@@ -175,8 +176,8 @@ def _add(
 ) -> None:  # fmt: skip
     """Add a weight times the selected pixels' grey levels to ``total`` (k,).
 
-    ``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are. ``chosen``
-    (k,) are the numbers of the selected pixels, those of band b from ``first[b]`` on.
+    ``place`` (m, 2, 9): where in the pattern, (row, col) [samples], the elements' points are.
+    ``chosen`` (k,) are the numbers of the selected pixels, those of band b from ``first[b]`` on.
     """
     rows, cols = selected.shape
     where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)

@@ -220,6 +220,15 @@ def test_edge_pixels_mix_material_and_background_in_their_shares(aperture: Apert
     np.testing.assert_allclose(image[far], expected[far], atol=1e-6)
 
 
+def test_fine_speckles_are_where_they_are_in_images_of_points() -> None:
+    """Blurs below 2 px need more than one sample a pixel."""
+    speckle = Speckle(SpeckleSpec(standard_deviation=0.08, blur_px=1.0, seed=9), GRID.shape)
+    state = ImagedState(PLATE, None, GRID, speckle, 0.1)
+    inside = material(state) & ~near_edges(material(state), 2)
+    at_points = state.average(np.zeros((1, 2)), np.ones(1), inside)
+    np.testing.assert_allclose(at_points, speckle.image()[inside], atol=1e-6)
+
+
 def test_background_and_material_far_from_edges_are_distinguished() -> None:
     mask = np.zeros((20, 20), dtype=np.bool_)
     mask[5:15, 5:15] = True

@@ -316,7 +316,7 @@ class Speckle:
 
     @property
     def spline(self) -> PeriodicSpline:
-        """The base layer as a spline, made when first asked for."""
+        """The base layer as a spline of positions in samples, made when first asked for."""
         return self._base.spline
 
     @property
