@@ -131,6 +131,29 @@ def test_finished_images_are_not_measured_again(plate: Plate, measured: Path) ->
     assert {path: path.stat().st_mtime_ns for path in (measured / "results").iterdir()} == before
 
 
+def test_gauges_are_read_and_shown(plate: Plate, measured: Path, tmp_path: Path) -> None:
+    gauges = tmp_path / "gauges.toml"
+    gauges.write_text(
+        '[[gauges]]\nname = "across"\nline = [[-0.6, 0.6], [0.6, 0.6]]\n'
+        '[[gauges]]\nname = "corner"\npolygon = [[0.5, 0.5], [0.7, 0.5], [0.6, 0.7]]\n'
+    )
+    found = measure(plate.folder / "ref.tif", plate.files, measured, gauges=gauges,
+                    mask=plate.folder / "mask.tif", pixel_size=GRID.pixel_size)  # fmt: skip
+    assert faults(found, "measure") == []
+    read = {(r["image"], r["gauge"], r["reads"]): r for r in found["gauges"]}
+    ends = np.array([[-0.6, 0.6], [0.6, 0.6]])
+    for name, load in (("a", 0.5), ("b", 1.0)):
+        length = read[name, "across", "length"]
+        true = float(np.linalg.norm(np.diff(ends + field(ends, load), axis=0)))
+        assert length["unit"] == "mm"
+        assert 0.0 < length["sd"] < 0.1 * GRID.pixel_size
+        assert length["value"] == pytest.approx(true, abs=4.0 * length["sd"])
+    assert (measured / "gauges.csv").is_file()
+    page = (measured / "report.html").read_text("utf-8")
+    assert "What gauges read in b" in page
+    assert "--gauges" in page
+
+
 def test_hdf5_comes_back_as_it_was(result: NodalResult, tmp_path: Path) -> None:
     path = tmp_path / "again.h5"
     write_result(path, result, Given("px"))

@@ -113,7 +113,7 @@ def plain_surface(
             f"expected all of a specimen without speckle in {name}, got material at "
             f"{reached} px of its border; take it from farther away, or crop nothing"
         )
-    contours = _contours(grey - middle, material)
+    contours = closed_contours(grey - middle, material)
     if not contours:
         return None
     slope = _slope(grey, contours)
@@ -143,7 +143,7 @@ def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | 
     return bright, 0.5 * (above + below), above - below
 
 
-def _contours(signed: FloatArray, material: BoolArray) -> tuple[FloatArray, ...]:
+def closed_contours(signed: FloatArray, material: BoolArray) -> tuple[FloatArray, ...]:
     """Closed contours (n, 2) at 0 around a material, the longest first."""
     found = []
     for points in find_contours(signed.astype(np.float64), 0.0):

@@ -197,6 +197,10 @@ def harvest(
         bool, typer.Option("--example", callback=_example, is_eager=True, help=_EXAMPLE)
     ] = False,
     whole_field: WholeField = None,
+    contours: Annotated[
+        bool | None,
+        typer.Option(help="Measure modes by the material's edges, too, beside speckle, or don't."),
+    ] = None,
     watch: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="Follow a running test: its photographs come here."),
@@ -225,7 +229,7 @@ def harvest(
     from modeharvest.runs.photographs.pipeline import harvest as harvest_photographs
 
     with bars() as progress:
-        summary = harvest_photographs(experiment, out, progress, whole_field)
+        summary = harvest_photographs(experiment, out, progress, whole_field, contours)
     print_report(photographs_report(summary), out)
 
 
@@ -262,6 +266,10 @@ def measure(
     log: Annotated[
         Path | None, typer.Option(help="What the testing machine wrote down, joined by time.")
     ] = None,
+    gauges: Annotated[
+        Path | None,
+        typer.Option(metavar="GAUGES.toml", help="Points, lines and areas that the report reads."),
+    ] = None,
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
@@ -281,7 +289,7 @@ def measure(
         summary = measure_images(
             reference, deformed, out, mask=mask, pixel_size=pixel_size, mesh=mesh,
             brightness=brightness, choice=FrameChoice(every=every),
-            log=None if log is None else LogTable(str(log)), progress=progress,
+            log=None if log is None else LogTable(str(log)), gauges=gauges, progress=progress,
         )  # fmt: skip
     print_report(measure_report(summary), out)
 

@@ -333,6 +333,7 @@ def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, s
         *_amplitude_cards(shown, names),
         *mode_cards(shown, names),
         *_wave_cards(shown, names),
+        *_contour_cards(shown, names),
     ]
 
 
@@ -412,6 +413,21 @@ def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]
                              "wave": f"{w} of φ{i}{remark}", "xi1": xi1, "xi2": xi2})  # fmt: skip
     words = text_of("photographs-waves")
     return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=len(frames) > 1)
+
+
+def _contour_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
+    """Modes by speckle and by contours, and their differences over the standard deviations."""
+    rows: list[dict[str, Cell]] = [
+        {**row, "photograph": names[frame["name"]] if k == 0 else "",
+         "what": f"{row['what']} of φ{row['mode']}",
+         "speckle": Measured(row["speckle"], (row["speckle_sd"],)),
+         "contours": Measured(row["contours"], (row["contours_sd"],)),
+         "difference": number(row["difference_sd"], 2)}
+        for frame in frames if frame.get("contours")
+        for k, row in enumerate(frame["contours"]["compared"])
+    ]  # fmt: skip
+    words = text_of("contours-beside")
+    return Card.tabular(ReportTable.of("contours-beside", rows), caption=words, wide=True)
 
 
 def notes(summary: Summary) -> list[str]:

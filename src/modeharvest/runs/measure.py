@@ -6,6 +6,7 @@
     results/NAME.h5 NAME.vtu NAME.csv      NAME      what was measured in one deformed image, see
     results/NAME_u_mm.tif ...                        modeharvest.idic.finite_element.files
     results/NAME_holes.csv                           the holes, where there is no speckle
+    gauges.csv  gauges_along.csv                     what gauges read, if any are named
     report.html  summary.json                        of all images
     stages.json  timings.json                        which stages are finished, what they took
 
@@ -16,7 +17,7 @@ the middle of the image, x right, y up.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -46,6 +47,7 @@ from modeharvest.idic.photograph.displacement import (
     residual,
     speckled,
 )
+from modeharvest.idic.photograph.gauges import read_gauges, write_gauges
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain import (
     PlainSurface,
@@ -99,7 +101,8 @@ class MeasureCase:
     ``mask``: an image, not black on material of the reference; None to find it by its speckle.
     ``pixel_size`` [mm]; None for lengths in px. ``mesh``: of the material, of T3 or T6 elements, a
     file that meshio reads; None to make it from the mask. ``brightness``: degree of the polynomials
-    by which gain and offset of an image may vary, 0 to 6. ``sequence``: the files that the names
+    by which gain and offset of an image may vary, 0 to 6. ``gauges``: a TOML file of them, that the
+    report shows. ``sequence``: the files that the names
     stand for, if they are of folders or videos; ``choice``: the command's options about them.
     """
 
@@ -111,13 +114,14 @@ class MeasureCase:
     brightness: int = 0
     sequence: ChosenFrames | None = None
     choice: tuple[str, ...] = ()
+    gauges: Path | None = None
 
     def __post_init__(self) -> None:
         Brightness(self.brightness, self.brightness)  # checks its degree
         if self.pixel_size is not None:
             require_within("expected a pixel size [mm]", self.pixel_size, 1e-9, 1e6)
         named = () if self.sequence else self.files.values()  # what a folder holds may be damaged
-        for path in (self.reference, *named, self.mask, self.mesh):
+        for path in (self.reference, *named, self.mask, self.mesh, self.gauges):
             if path is not None:
                 require_file(path, "a file", "check its name")
 
@@ -302,6 +306,11 @@ class MeasureRun(StagedRun[MeasureCase]):
         start, light = block_motion(pair, body, known, names), self.case.brightness
         return (displacement_from(start, pair, body, light_degree=light, progress=self.progress),)
 
+    def _with_roots(self) -> Iterator[tuple[str, NodalResult]]:
+        """Each image's displacement with the roots of its covariance."""
+        for name in self.results():
+            yield name, read_result(self.folder / f"results/{name}.h5", with_roots=True)
+
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN off the material."""
         return residual(self.pair(name), result.displacement_on(), self.case.brightness)
@@ -315,12 +324,19 @@ class MeasureRun(StagedRun[MeasureCase]):
         """Do everything that is not finished; returns the content of ``summary.json``."""
         with exclusive(self.folder):
             require_writable(self.folder)
+            gauges = read_gauges(self.case.gauges) if self.case.gauges else ()
             results = self.results()
             summary = self._summary(results)
             from modeharvest.report.measure import measure_report
             from modeharvest.report.model import write_page
 
-            report = measure_report(summary, results, self.residual, self.picture)
+            read = gauges and write_gauges(self.folder, gauges, self._with_roots(), self.case.unit)
+            summary["gauges"] = [
+                {"image": image, "gauge": gauge, "reads": what, **reading._asdict()}
+                for image, own in (read or {}).items()
+                for gauge, found in own.items() for what, reading in found.items()
+            ]  # fmt: skip
+            report = measure_report(summary, results, self.residual, self.picture, gauges)
             write_page(report, self.folder / "report.html", self.progress)
             write_json(self.folder / "summary.json", summary)
         return summary
@@ -334,7 +350,8 @@ class MeasureRun(StagedRun[MeasureCase]):
                 + [f"--mask {case.mask}"] * (case.mask is not None)
                 + [f"--pixel-size {case.pixel_size:g}" for _ in [0] if case.pixel_size]
                 + [f"--mesh {case.mesh}"] * (case.mesh is not None)
-                + [f"--brightness {case.brightness}"] * (case.brightness > 0) + [*case.choice]
+                + [f"--brightness {case.brightness}"] * (case.brightness > 0)
+                + [f"--gauges {case.gauges}"] * (case.gauges is not None) + [*case.choice]
                 + [f"--out {self.folder}"]
             ),
             "unit": case.unit,
@@ -411,12 +428,13 @@ def measure(
     brightness: int = 0,
     choice: FrameChoice | None = None,
     log: LogTable | None = None,
+    gauges: Path | str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
 
     ``deformed`` may also be folders and videos; ``choice`` among their frames; ``log`` of the
-    testing machine.
+    testing machine; ``gauges``: a TOML file of them, for the report.
 
     Leaves its files in ``folder`` and returns what ``summary.json`` holds. InputError if an image,
     the mask or the mesh can't be used.
@@ -430,6 +448,6 @@ def measure(
     case = MeasureCase(
         sequence.reference, names, None if mask is None else Path(mask),
         pixel_size, None if mesh is None else Path(mesh), brightness, sequence,
-        tuple(flags),
+        tuple(flags), None if gauges is None else Path(gauges),
     )  # fmt: skip
     return MeasureRun(case, Path(folder), progress).all()

@@ -16,7 +16,7 @@ from PIL import Image
 
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.photograph.finished import FinishedRun
-from modeharvest.idic.photograph.gauges import Readings
+from modeharvest.idic.photograph.gauges import Gauge, Readings
 from modeharvest.report.figures import maps, style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.util.arrays import FloatArray, FloatImage
@@ -106,18 +106,45 @@ def _pixels(draw: Draw) -> NDArray[np.uint8]:
         return np.pad(pixels, [*more, (0, 0)], constant_values=255)
 
 
-def draw_gauge(name: str, readings: Sequence[Readings]) -> Figure:
-    """Draw the strains that a gauge has read in each image, with 95 % intervals."""
+def draw_gauge(name: str, readings: Sequence[Readings], strain: FloatArray | None = None) -> Figure:
+    """Draw the strains that a gauge has read in each image, with 95 % intervals.
+
+    Over the images' numbers, or over a strain (n,) of each.
+    """
     drawn = style.figure(3.6, 2.4)
     axes = drawn.add_axes((0.22, 0.19, 0.75, 0.69))
     number = np.arange(1, len(readings) + 1)
+    at = number if strain is None else 100.0 * strain
     for k, what in enumerate(what for what in readings[0] if "strain" in what):
         value, sd = np.array([r[what][:2] for r in readings], dtype=np.float64).T
-        axes.errorbar(number, value, 1.96 * np.nan_to_num(sd), color=style.colour(k), marker="o",
+        axes.errorbar(at, value, 1.96 * np.nan_to_num(sd), color=style.colour(k), marker="o",
                       ms=3, capsize=2, lw=1.2, label=what.replace("_", " "))  # fmt: skip
-    axes.set(xlabel="image", ylabel="strain [-]", xticks=number[:: 1 + len(number) // 10])
+    axes.set(xlabel="mean strain along x [%]", ylabel="strain [-]")
+    if strain is None:
+        axes.set(xlabel="image", xticks=number[:: 1 + len(number) // 10])
     axes.set_title(name, fontsize=8.5, loc="left")
     axes.legend()
+    return drawn
+
+
+def draw_gauges_on(
+    result: NodalResult, gauges: Sequence[Gauge], picture: FloatImage | None, unit: str
+) -> Figure:
+    """Draw gauges where they have moved to, on the deformed photograph (rows, cols), 0 to 1."""
+    grid = result.grid
+    factor = max(1, round(max(grid.shape) / _CELLS))
+    frame = maps.MapFrame(MeshBoundary.of(result.mesh), grid.binned(factor), factor, grid.extent)
+    drawn, axes = maps.empty_map(frame, _WIDTH, unit)
+    if picture is not None:
+        maps.show_grey(axes, frame, picture, None, grid)
+    for k, gauge in enumerate(gauges):
+        corners = gauge.corners(grid)
+        moved = corners + np.nan_to_num(result.at(corners))  # a polygon's may be in a hole
+        closed = np.vstack([moved, moved[:1]]) if gauge.polygon else moved
+        axes.plot(*closed.T, "o-", color=style.colour(k), ms=4, lw=1.6)
+        axes.annotate(gauge.name, moved[0], (5, 5), textcoords="offset points", fontsize=8.5,
+                      color=style.colour(k), weight="bold")  # fmt: skip
+    axes.set(xlim=frame.limits[:2], ylim=frame.limits[2:])
     return drawn
 
 

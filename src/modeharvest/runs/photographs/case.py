@@ -65,6 +65,14 @@ class LocalTable:
 
 
 @dataclass(frozen=True)
+class ContourTable:
+    """Contours of a speckled specimen as a second measurement of its modes."""
+
+    measure: bool = False
+    """Whether they are measured, too."""
+
+
+@dataclass(frozen=True)
 class NoiseTable:
     """The camera's noise."""
 
@@ -163,6 +171,7 @@ class PhotographCase(CaseModel):
     noise: NoiseTable = NoiseTable()
     correlation: PhotographOptions = PhotographOptions()
     whole_field: WholeFieldOptions = WholeFieldOptions()
+    contours: ContourTable = ContourTable()
 
     _base: Path = PrivateAttr(Path())
     _written: Images | None = PrivateAttr(None)

@@ -9,6 +9,7 @@
     results/NAME_holes.csv                          the holes' shapes, where there is no speckle
     whole_field/NAME.h5  NAME.vtu                   whole displacements, where they are asked for
     whole_field/NAME_refit.json                     the ansatz of the result, refitted to it
+    contours/NAME.json                  contours    the same by contours beside speckle, if wanted
     report.html  summary.json           report      everything that was found
     stages.json timings.json                        which stages are finished, what they took
 """
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,12 @@ from modeharvest.idic.photograph.plain import (
     plain_surface,
     write_holes,
 )
+from modeharvest.idic.photograph.speckled_edges import (
+    ByContours,
+    body_for_edges,
+    edges_of_speckled,
+    measure_by_contours,
+)
 from modeharvest.idic.result import Covariance, Result
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import read_pattern
@@ -55,7 +62,7 @@ from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import CaseModel
 from modeharvest.runs.photographs import prepare
-from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.case import ContourTable, PhotographCase
 from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
 from modeharvest.runs.photographs.results import (
     MOST_SHOWN,
@@ -248,6 +255,33 @@ class HarvestRun(StagedRun[PhotographCase]):
         return self._with_whole(name, pair, measured)
 
     @cached_property
+    def _beside(self) -> tuple[Mapping[str, ByContours], dict[str, str]]:
+        """Modes by contours of speckled photographs, if asked for, and why there are none."""
+        folder, grid, cell = self.folder / "contours", self.prepared.grid, self.case.specimen
+        cell_px = cell.cell_size / grid.pixel_size
+        if not self.case.contours.measure or self._plain is not None:
+            return {}, {}
+
+        @cache
+        def reference() -> tuple[PlainSurface, Body]:
+            mask = self.prepared.mask()
+            edges = edges_of_speckled(self.prepared.image(), mask, cell_px)
+            return edges, body_for_edges(mask, grid, cell_px)
+
+        def work(name: str, _: object) -> tuple[Sequence[Path], dict[str, Any]]:
+            (edges, body), path = reference(), folder / f"{name}.json"
+            pair, speckle = self.prepared.pair(name), self.results()[name].result
+            found = measure_by_contours(edges, pair, speckle, cell.cell_size, body, self.progress)
+            found.result.write(path)
+            return (path,), picked(found, "edge_sd_px")
+
+        def read(name: str, about: dict[str, Any]) -> ByContours:
+            return ByContours(Result.read(folder / f"{name}.json"), about["edge_sd_px"])
+
+        keys = {name: digest(["contours", self._keys[name]]) for name in self.results()}
+        return self.do_in_turn("contours", keys, folder, work, read)
+
+    @cached_property
     def _plain(self) -> PlainSurface | None:
         """What the reference shows if the specimen has no speckle."""
         if not self.prepared.is_plain:
@@ -308,6 +342,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         pair, cell = self.prepared.pair(name), case.specimen.cell_size
         box = geometry.region.cellular
         x, y = _axes(geometry.region.domain)
+        beside, why = self._beside
         test = ResidualTest(result.residual_correlation, result.pixels)
         if self._plain is None or not measured.whole:
             noise = image_noise(pair, self.prepared.noise)
@@ -332,9 +367,9 @@ class HarvestRun(StagedRun[PhotographCase]):
             else field_errors(result, x, y, found.by_model_error),
             spectrum=spectrum, pattern=pattern,
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()), w=w,
-            whole=measured.whole, rigid=self.prepared.rigid.get(name),
+            whole=measured.whole, contours=beside.get(name), rigid=self.prepared.rigid.get(name),
             start_text=tuple(s for s in measured.text if s not in pattern.text),
-            warnings=(*found.warnings, *measured.warnings),
+            warnings=(*found.warnings, *measured.warnings, *([why[name]] if name in why else ())),
         )  # fmt: skip
 
     def _errors(self, name: str, measured: MeasuredPhotograph) -> Covariance:
@@ -376,16 +411,19 @@ def harvest(
     folder: Path | str,
     progress: Progress = silent,
     whole_field: bool | None = None,
+    contours: bool | None = None,
 ) -> dict[str, Any]:
     """Harvest modes from photographs of a test; what ``modeharvest harvest`` does.
 
     ``case``: the path of its TOML file, or the case itself; ``folder``: where to leave the files;
-    ``whole_field``: whether to measure whole displacements, None for what the case says.
+    ``whole_field``: whether to measure whole displacements, ``contours``: whether to measure modes
+    by them beside speckle, None for what the case says.
     Returns the content of ``summary.json``. Raises InputError if the case can't be used; before
     anything is computed, if a file is missing.
     """
     found = PhotographCase.of(case)
-    found = found.model_copy(update=change_of(found.whole_field, whole_field))
+    beside = {} if contours is None else {"contours": ContourTable(contours)}
+    found = found.model_copy(update=change_of(found.whole_field, whole_field) | beside)
     prepare.require_inputs(found := prepare.with_chosen_frames(found, Path(folder), progress))
     source = "CASE" if isinstance(case, CaseModel) else str(case)
     return HarvestRun(found, Path(folder), progress, source).all()

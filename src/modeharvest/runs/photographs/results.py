@@ -5,8 +5,8 @@ Keys of the latter: docs/how-to/harvest.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,13 @@ from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.holes import HoleLattice
 from modeharvest.idic.photograph.matching import RigidMotion
+from modeharvest.idic.photograph.speckled_edges import ByContours
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.noise import CameraNoise
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
-from modeharvest.idic.uncertainty.covariance import FieldErrors, propagated_sd
+from modeharvest.idic.uncertainty.covariance import FieldErrors, field_errors, propagated_sd
 from modeharvest.idic.uncertainty.identifiability import Identifiability
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
@@ -82,6 +83,8 @@ class HarvestedFrame:
     """What the ansatz leaves of a local DIC's field, or of the whole displacement's."""
     whole: WholeField | None = None
     """The whole displacement, if it was measured."""
+    contours: ByContours | None = None
+    """The same ansatz by contours beside speckle, if they were measured."""
     rigid: RigidMotion | None = None
     """What was taken out of the photograph before it was measured; None if it was as good as
     upright."""
@@ -346,6 +349,7 @@ def frame_numbers(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         },
         "local": _local(harvest, frame),
         "whole_field": _whole(harvest, frame),
+        "contours": _contours(harvest, frame),
         "modes": [mode_numbers(harvest, frame, i) for i in frame.modes],
         "pattern_reading": () if frame.pattern is None else frame.pattern.text,
         "rigid_motion": frame.rigid,
@@ -368,6 +372,60 @@ def _whole(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
     known = harvest.truth.frames.get(frame.name) if harvest.truth else None
     errors = asdict(known.whole) if known and known.whole else {}
     return {**errors, **asdict(whole_numbers(frame.whole, frame.result, harvest.mask))}
+
+
+def _contours(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
+    """What speckle and contours say of the modes, and their differences."""
+    found = frame.contours
+    if found is None:
+        return None
+    result, x, y, errors = found.result, frame.error_x, frame.error_y, found.result.errors
+    assert errors
+    assert errors.by_model_error is not None
+    by_contours = replace(
+        frame, result=result, by_noise=field_errors(result, x, y, errors.by_noise),
+        by_model_error=field_errors(result, x, y, errors.by_model_error),
+    )  # fmt: skip
+    compared = []
+    for i in frame.modes:
+        rows = (_values(mode_numbers(harvest, one, i)) for one in (frame, by_contours))
+        for (what, unit, speckle, sd), (_, _, value, own_sd) in zip(*rows, strict=True):
+            compared.append(
+                {"mode": i + 1, "what": what, "unit": unit, "speckle": speckle, "speckle_sd": sd,
+                 "contours": value, "contours_sd": own_sd,
+                 "difference_sd": (value - speckle) / float(np.hypot(sd, own_sd))}
+            )  # fmt: skip
+    return {
+        "edge_sd_px": found.edge_sd_px,
+        "pattern_ratio": _pattern_ratio(harvest, result, frame.result),
+        "compared": compared,
+        "warnings": errors.warnings,
+    }
+
+
+def _values(mode: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float]]:
+    """Name, unit, value and standard deviation of all that a mode is described by."""
+    sd = mode["v_max_sd_model_error_mm"]
+    yield "largest v", "mm", mode["v_max_mm"], mode["v_max_sd_noise_mm"] if sd is None else sd
+    for p in mode["parameters"]:
+        sd = p["sd_noise"] if p["sd_model_error"] is None else p["sd_model_error"]
+        yield p["name"], p["unit"], p["value"], sd
+    for k, wave in enumerate(mode["waves"], start=1):
+        known = wave["sd_noise"] if wave["sd_model_error"] is None else wave["sd_model_error"]
+        for axis, xi, sd in zip("xy", wave["xi"], () if known is None else known, strict=False):
+            yield f"wave vector {k}, {axis}", "1/l", xi, sd
+
+
+def _pattern_ratio(harvest: Harvest, result: Result, other: Result) -> float | None:
+    """One result's pattern over another's, by least squares over the part with holes."""
+    box, modes = harvest.geometry.region.cellular, range(len(result.ansatz.modes))
+    x, y = (
+        c + h * np.linspace(-1, 1, _CELLS // 2) for c, h in zip(box.centre, box.half, strict=True)
+    )
+    a, b = (sum(r.ansatz.fluctuation(i, r.unknowns, x[None], y[:, None]) for i in modes)
+            for r in (result, other))  # fmt: skip
+    square = float(np.sum(b * b))
+    return float(np.sum(a * b)) / square if square > 0.0 else None
 
 
 def _local(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:

@@ -1,0 +1,185 @@
+"""Contours of a speckled specimen, and the modes that they alone show, as a second measurement.
+
+A pixel at an edge shows b + s (m - b), b the background's grey level around, m the material's just
+inside, and s the share of material that is sought: by least squares over a blur, so that bright
+speckles count and dark ones, which look like background, hardly do. A contour is where s is one
+half. Polynomials along it take away what is finer than the elements whose edges follow it.
+
+What the speckle does to an edge is random, and rough: how rough the reference's contours are says
+how uncertain they are. Both photographs show the same speckle at an edge, so about half of the
+variance is in common and doesn't count. Of the speckle inside nothing is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates
+
+from modeharvest.idic.finite_element.contours import displacement_from_contours
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.finite_element.result import refitted
+from modeharvest.idic.finite_element.system import SAMPLES, Body
+from modeharvest.idic.photograph.plain import PlainSurface, closed_contours, matched_contours
+from modeharvest.idic.result import Covariance, Result
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.photographs.contour import Contour
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+from modeharvest.util.errors import InputError
+from modeharvest.util.masks import grown, shrunk
+from modeharvest.util.progress import Progress, silent
+
+ELEMENTS_A_CELL = 5
+"""Along edges."""
+_SURE_PX, _BAND_PX = 2.0, 3.0
+"""Farther than this from a mask's edge pixels are material or background, whatever the mask is off
+by; and how far from it edges are looked for."""
+_REACH_PX, _AROUND_PX, _BLUR_PX = 1.5, 25.0, 0.7
+"""Gaussian widths: of the material's level, the background's, and the least squares."""
+_SMOOTHED = 1.0 / 6.0
+"""Gaussian width of what polynomials are fitted to, over an element's edge."""
+_STEP_PX = 0.5
+_CURVED, _ROUGH = 1.0 / 8.0, 1.0 / 10.0
+"""Gaussian width of parabolas that leave a contour's roughness [cells], and length over which that
+is averaged, longer than speckles are."""
+_COMMON = 0.5
+"""Share of the variance that both photographs' contours have in common, about: see
+docs/explanation/contours.md."""
+_SHOWN_PX = 10.0
+_LEAST_HOLE = 0.1
+"""Area of a contour over the holes' median; smaller ones are dirt, or speckle taken for a hole."""
+
+
+@dataclass(frozen=True, eq=False)
+class ByContours:
+    """The ansatz of a photograph, measured by contours instead of speckle."""
+
+    result: Result
+    """With ``errors``: by the contours' noise, and by all that they leave open, as for a specimen
+    without speckle: its law, whether it slides on plates, springs."""
+    edge_sd_px: float
+    """Standard deviation of an edge's displacement, averaged along 10 px [px]."""
+
+
+def body_for_edges(mask: BoolArray, grid: PixelGrid, cell_px: float) -> Body:
+    """A mesh of the material whose edges are as long as contours can tell."""
+    edge = max(4.0, cell_px / ELEMENTS_A_CELL)
+    return FiniteElementOptions(2.0 * edge, edge).body(mask, grid)
+
+
+def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> PlainSurface:
+    """Contours (row, col) of a speckled material in an image (rows, cols); ``mask``: about where.
+
+    Their noise is what one of two photographs of the same speckle adds to a displacement's.
+    InputError if the material reaches the border of the image, or shows no edges.
+    """
+    if mask[[0, -1]].any() or mask[:, [0, -1]].any():
+        raise InputError("contours: expected all of the specimen in the picture, got a part of it")
+    share, weight = _share_of_material(np.asarray(image, np.float32), mask)
+    found = closed_contours(share - 0.5, mask)
+    areas = [abs(Contour(points).moments[0]) for points in found]
+    least = _LEAST_HOLE * float(np.median(areas[1:])) if len(areas) > 1 else 0.0
+    width = _SMOOTHED * max(4.0, cell_px / ELEMENTS_A_CELL)
+    kept = [p for p, area in zip(found, areas, strict=True) if area >= least]
+    if not kept:
+        raise InputError("contours: expected edges of the material in the picture, got none")
+    contours = tuple(_smoothed(points, weight, width)[0] for points in kept)
+    return PlainSurface(mask, contours, (1.0 - _COMMON) * _roughness(kept, weight, cell_px))
+
+
+def _roughness(contours: Sequence[FloatArray], weight: FloatArray, cell_px: float) -> float:
+    """Variance of contours' distances by speckle, times the length over which they are correlated.
+
+    That of means over neighbouring lengths (D. W. Allan's), which shapes hardly add to [px^3].
+    """
+    squares = []
+    for points in contours:
+        smooth, off, step = _smoothed(points, weight, _CURVED * cell_px)
+        along = np.gradient(smooth, axis=0)
+        across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        distance = (off * across).sum(axis=1) / np.linalg.norm(across, axis=1)
+        few = max(1, round(_ROUGH * cell_px / step))
+        count = len(distance) // few
+        means = distance[: count * few].reshape(count, few).mean(axis=1)
+        squares.append(0.5 * few * step * np.diff(means) ** 2)
+    return float(np.mean(np.concatenate(squares)))
+
+
+def _share_of_material(grey: FloatImage, mask: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """(rows, cols) share of material in each pixel near the edge, and how well it is known.
+
+    Where the material is as dark as the background the mask decides.
+    """
+    material, background = shrunk(mask, _SURE_PX), shrunk(~mask, _SURE_PX + 1.0)
+    inside = _mean_over(grey, material, _REACH_PX)
+    contrast = inside - _mean_over(grey, background, _AROUND_PX)
+    narrow = mask & ~shrunk(mask, _SURE_PX + 1.0) & material  # as near to the edge as is sure
+    ridge = np.float32(np.mean((grey - inside)[narrow] ** 2)) if narrow.any() else np.float32(1e-12)
+    product = _blurred((grey - inside + contrast) * contrast + ridge * mask)
+    square = _blurred(contrast**2)
+    band = grown(mask, _BAND_PX) & ~shrunk(mask, _BAND_PX)
+    share = np.where(band, product / (square + ridge), mask)
+    return share.astype(np.float64), (square / (square + ridge) + 1e-2).astype(np.float64)
+
+
+def _blurred(image: FloatImage) -> FloatImage:
+    return np.asarray(gaussian_filter(image, _BLUR_PX, output=np.float32))
+
+
+def _mean_over(grey: FloatImage, region: BoolArray, width: float) -> FloatImage:
+    """(rows, cols) mean grey level of a region's pixels around each."""
+    typical = np.float32(grey[region].mean()) if region.any() else np.float32(0.0)
+    total = gaussian_filter(np.where(region, grey - typical, np.float32(0.0)), width)
+    weight = gaussian_filter(region.astype(np.float32), width) + np.float32(1e-6)
+    return np.asarray(typical + total / weight, dtype=np.float32)
+
+
+def _smoothed(
+    points: FloatArray, weight: FloatArray, width: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """A contour (n, 2) as parabolas fitted along it, what they leave of it, and its step [px].
+
+    Their weights are Gaussian, of a width [px], times the image's.
+    """
+    curve = Contour(points)
+    x, step = curve.evenly(_STEP_PX)
+    w = map_coordinates(weight, x.T, order=1, mode="nearest")
+    reach = int(min(4.0 * width / step, (len(x) - 1) // 2))
+    t = np.arange(-reach, reach + 1) * (step / width)
+    window = np.exp(-0.5 * t**2)
+    around = [(window * t**k)[::-1] for k in range(5)]
+    moments = np.stack([convolve1d(w, part, mode="wrap") for part in around])
+    right = [convolve1d(w[:, None] * x, part, axis=0, mode="wrap") for part in around[:3]]
+    A = np.stack([moments[k : k + 3] for k in range(3)]).transpose(2, 0, 1)
+    smooth = np.linalg.solve(A, np.stack(right, axis=1))[:, 0]
+    return smooth, x - smooth, step
+
+
+def measure_by_contours(
+    reference: PlainSurface, pair: ImagePair, speckle: Result, cell_size: float, body: Body,
+    progress: Progress = silent,
+) -> ByContours:  # fmt: skip
+    """Measure a result's ansatz by contours alone; the result is where the fit starts.
+
+    reference : its contours, by :func:`edges_of_speckled`.
+    pair : the photographs with both masks of the material.
+    body : by :func:`body_for_edges`, of the reference's mask.
+
+    InputError if the contours don't belong together, or can't be found.
+    """
+    grid, (mask, there) = pair.grid, pair.masks
+    deformed = edges_of_speckled(pair.deformed, there, cell_size / grid.pixel_size)
+    # A buckled hole's ends are too sharp to tell roughness from shape: the speckle is the same.
+    matched = matched_contours(reference, replace(deformed, noise=reference.noise), grid)
+    start = matched.start(body.mesh.nodes)
+    measured = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
+    fit = refitted(measured, speckle.ansatz, speckle.unknowns, mask)
+    assert measured.roots is not None
+    by_noise = replace(measured, roots=measured.roots[..., :SAMPLES])
+    result = refitted(by_noise, fit.ansatz, fit.unknowns, mask)
+    errors = Covariance(result.covariance(), fit.covariance(), measured.warnings)
+    edge_sd = float(np.sqrt(2.0 * reference.noise / _SHOWN_PX))
+    return ByContours(replace(result, errors=errors), edge_sd)

@@ -1,0 +1,93 @@
+"""Contours of speckled photographs: a second measurement of the modes, beside the speckle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from summary_schemas import faults
+from synthetic_photographs import Photographed, lattice_points
+
+from modeharvest.fem.field import Solution
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.photograph.speckled_edges import edges_of_speckled
+from modeharvest.idic.result import Result
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.photographs.contour import Contour
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.runs.photographs.pipeline import harvest
+from modeharvest.util.errors import InputError
+from modeharvest.validation.whole_field import v_percent, waves_percent
+
+pytest.importorskip("gmsh")
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
+
+SHIPPED = Path(__file__).parents[1] / "src/modeharvest/cases/paper-virtual.h5"
+PITCH, PIXEL, FINER, DIAMETER = 1.9, 0.035, 0.025, 1.4
+CELLULAR, DOMAIN = Box.centred(4 * PITCH, 4 * PITCH), Box.centred(4 * PITCH + 1.6, 4 * PITCH + 1.6)
+HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, PITCH / 2))
+PHOTOGRAPHED = Photographed(PixelGrid.centred(310, 310, PIXEL), DOMAIN, HOLES, DIAMETER)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped specimen, buckled: what contours don't show follows from its equilibrium."""
+    path = tmp_path_factory.mktemp("photographs")
+    spec = ImagingSpec(
+        FINER, 20, background=0.06, speckle=SpeckleSpec(standard_deviation=0.1, blur_px=1.0),
+        sensor=Sensor(read_noise=0.01), bits=8,
+    )  # fmt: skip
+    make_images(Solution.read(SHIPPED), spec, path, [0.128])
+    (path / "experiment.toml").write_text(
+        '[images]\nreference = "reference_8bit.tif"\ndeformed = ["deformed_*_8bit.tif"]\n'
+        f"[scale]\npixel_size = {FINER}\n[specimen]\ncell_size = {PITCH}\n"
+    )
+    return path
+
+
+def test_edges_are_found_to_parts_of_a_pixel_and_know_their_noise() -> None:
+    image, grid, mask = PHOTOGRAPHED.image(), PHOTOGRAPHED.grid, PHOTOGRAPHED.mask
+    found = edges_of_speckled(image, mask, PITCH / PIXEL)
+    assert len(found.contours) == 1 + len(HOLES)
+    off, lengths = [], []
+    for points in found.contours[1:]:
+        contour = Contour(np.column_stack(grid.to_mm(*points.T)))
+        x, _ = contour.evenly(0.5 * PIXEL)
+        nearest = HOLES[np.linalg.norm(HOLES - contour.moments[1], axis=1).argmin()]
+        off.append((np.linalg.norm(x - nearest, axis=1) - DIAMETER / 2) / PIXEL)
+        lengths.append(contour.length / PIXEL)
+    every = np.concatenate(off)
+    assert abs(every.mean()) < 0.25  # of both photographs alike
+    assert every.std() < 0.5
+    # A hole's mean radius averages noise over its edge; half of the variance is in common.
+    of_means = np.var([part.mean() for part in off]) * np.mean(lengths)
+    assert 0.3 < 2.0 * found.noise / of_means < 3.0
+
+
+def test_contours_agree_with_the_speckle(folder: Path, tmp_path: Path) -> None:
+    summary = harvest(folder / "experiment.toml", tmp_path, contours=True)
+    assert faults(summary, "harvest") == []
+    (frame,) = summary["frames"]
+    beside = frame["contours"]
+    images, found = ImageSet.read(folder), Result.read(tmp_path / f"contours/{frame['name']}.json")
+    true = images.truth(0.128).displacement
+    inside = np.isfinite(true).all(axis=-1)
+    best = fit_displacement(true, found.grid, found.ansatz, found.unknowns, inside)
+    assert v_percent(found, best) < 2.0
+    assert waves_percent(found, best) < 0.5
+    of = {row["what"]: row for row in beside["compared"]}
+    assert abs(of["wave vector 1, x"]["contours"]) == pytest.approx(0.5, rel=5e-3)
+    assert np.sqrt(np.mean([row["difference_sd"] ** 2 for row in of.values()])) < 2.0
+    assert beside["edge_sd_px"] < 0.5
+    assert "by contours alone" in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_a_part_of_a_specimen_is_refused_in_a_line() -> None:
+    image, mask = PHOTOGRAPHED.image()[60:], PHOTOGRAPHED.mask[60:]
+    with pytest.raises(InputError, match="expected all of the specimen in the picture"):
+        edges_of_speckled(image, mask, PITCH / PIXEL)
