@@ -47,7 +47,7 @@ _CURVED, _ROUGH = 1.0 / 8.0, 1.0 / 10.0
 is averaged, longer than speckles are."""
 _COMMON = 0.5
 """Share of the variance that both photographs' contours have in common, about: see
-docs/explanation/contours.md."""
+docs/explanation/contours_beside.md."""
 _SHOWN_PX = 10.0
 _LEAST_HOLE = 0.1
 """Area of a contour over the holes' median; smaller ones are dirt, or speckle taken for a hole."""
