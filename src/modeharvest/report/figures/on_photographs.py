@@ -142,8 +142,8 @@ def draw_gauges_on(
         moved = corners + np.nan_to_num(result.at(corners))  # a polygon's may be in a hole
         closed = np.vstack([moved, moved[:1]]) if gauge.polygon else moved
         axes.plot(*closed.T, "o-", color=style.colour(k), ms=4, lw=1.6)
-        axes.annotate(gauge.name, moved[0], (5, 5), textcoords="offset points", fontsize=8.5,
-                      color=style.colour(k), weight="bold")  # fmt: skip
+        axes.annotate(gauge.name, moved[0], (6, 6), textcoords="offset points", fontsize=8.5,
+                      color=style.colour(k), bbox={"fc": "white", "lw": 0, "pad": 1.5})  # fmt: skip
     axes.set(xlim=frame.limits[:2], ylim=frame.limits[2:])
     return drawn
 
