@@ -3,12 +3,14 @@
 ::
 
     scripts/env python benchmarks/contours.py [--pixel-size 0.03] [--only NAME ...] [--seeds N]
+        [--picture docs/images/contours_part.png]
 
 The shipped specimen, buckled at a nominal strain of 12.8 %, is photographed without speckle: pixels
 that average, a lens of 0.6 px, 8 bits. A row changes one thing. The specimen's law, Ogden of
 exponent 3, isn't the one that is assumed, except where the row says so. With seeds instead: how
 often 95 % intervals hold, of u and of the ansatz refitted to it, over noise of 1 % and sizes of
-pixels up to a tenth larger, hence edges that lie otherwise on the pixels.
+pixels up to a tenth larger, hence edges that lie otherwise on the pixels. A picture shows the row
+"middle" instead.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
@@ -32,7 +36,7 @@ from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.contours import displacement_from_contours
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import NodalResult, refitted
-from modeharvest.idic.photograph.plain import matched_contours, plain_surface
+from modeharvest.idic.photograph.plain import displacement_of_plain, matched_contours, plain_surface
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
@@ -43,6 +47,7 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.util.arrays import FloatArray, FloatImage
 
+mpl.use("Agg")
 SHIPPED = Path(__file__).parents[1] / "src/modeharvest/cases/paper-virtual.h5"
 STRAINS = (0.078, 0.128)
 HEADS = (
@@ -63,6 +68,19 @@ class Row:
     deformed: Callable[[FloatImage], FloatImage] = np.asarray
     turn_deg: float = 0.0
     law: Material | None = None
+    rows: tuple[float, float] = (0.0, 1.0)
+    cols: tuple[float, float] = (0.0, 1.0)
+    """The part of the pictures that is taken."""
+
+    @property
+    def is_part(self) -> bool:
+        """Whether not all is in view."""
+        return (self.rows, self.cols) != ((0.0, 1.0), (0.0, 1.0))
+
+    def window(self, shape: tuple[int, ...]) -> tuple[slice, ...]:
+        """Of pictures (rows, cols)."""
+        parts = zip((self.rows, self.cols), shape, strict=True)
+        return tuple(slice(round(a * n), round(b * n)) for (a, b), n in parts)
 
 
 def light(image: FloatImage) -> FloatImage:
@@ -90,6 +108,8 @@ ROWS = (
     Row("turned by 3 degrees", turn_deg=3.0), Row("the specimen's own law", law=Ogden()),
     Row("Poisson's ratio 0.35", law=Ogden((2.0,), (2.0,), 7.0 / 3.0)),
     Row("two-term I1 law", law=TwoTermI1()),
+    Row("cut across", cols=(0.0, 0.6)), Row("cut along", rows=(0.0, 0.5)),
+    Row("middle", rows=(0.2, 0.8), cols=(0.2, 0.8)),
 )  # fmt: skip
 
 
@@ -107,7 +127,7 @@ def photographs(folder: Path, row: Row, seed: int) -> tuple[FloatImage, FloatIma
     f, g = (read_image(folder / f"{name}.tif") for name in ("reference", tag))
     pictures = row.reference(f), row.deformed(turned(g, np.deg2rad(row.turn_deg)))
     noisy = (p + row.noise * rng.standard_normal(p.shape, dtype=np.float32) for p in pictures)
-    first, second = (quantise(p, 8).astype(np.float32) for p in noisy)
+    first, second = (quantise(p, 8).astype(np.float32)[row.window(p.shape)] for p in noisy)
     return first, second
 
 
@@ -126,6 +146,8 @@ def measured(folder: Path, grid: PixelGrid, row: Row, seed: int) -> NodalResult:
     assert seen[0]
     assert seen[1]
     body = FiniteElementOptions().body(seen[0].mask, grid)
+    if row.law is None:
+        return displacement_of_plain(seen[0], g, grid, body)[0]
     contours = matched_contours(seen[0], seen[1], grid)
     start = contours.start(body.mesh.nodes)
     return displacement_from_contours(contours.seen, body, grid, start, row.law)
@@ -149,13 +171,14 @@ def rows(pixel_size: float, only: list[str]) -> Iterator[str]:
         pairs = imaged(pixel_size, Path(name))
         for row in (r for r in ROWS if not only or r.name in only):
             pair = pairs[row.strain]
-            grid, px = pair.grid, pair.grid.pixel_size
-            found = measured(Path(name), grid, row, 0)
             assert pair.truth
-            u = truth(pair.truth.displacement, grid, np.deg2rad(row.turn_deg))
+            u, px = pair.truth.displacement[row.window(pair.grid.shape)], pair.grid.pixel_size
+            grid = PixelGrid.centred(*u.shape[:2], px)
+            found = measured(Path(name), grid, row, 0)
+            u = truth(u, grid, np.deg2rad(row.turn_deg))
             off, sd, there = compared(found, u)
             ratio = waves = float("nan")
-            if not row.turn_deg and row.strain > 0.1:  # the same frame, and a pattern
+            if not (row.turn_deg or row.is_part) and row.strain > 0.1:  # one frame, and a pattern
                 ratio, waves = against_best_fit(*refits(specimen, found, u, there, row.strain))
             line = [
                 np.sqrt(np.mean(off**2)) / px, np.linalg.norm(off, axis=1).max() / px,
@@ -213,13 +236,43 @@ def against_best_fit(own: Result, best: Result) -> tuple[float, float]:
     return 100.0 * ratio, 100.0 * float(np.abs(waves[0] / waves[1] - 1.0).max())
 
 
+def draw(pixel_size: float, file: Path) -> None:
+    """The deformed picture of the row "middle", |u| in it, and its error."""
+    row = next(row for row in ROWS if row.name == "middle")
+    with tempfile.TemporaryDirectory() as name:
+        pair = imaged(pixel_size, Path(name))[row.strain]
+        assert pair.truth
+        u = pair.truth.displacement[row.window(pair.grid.shape)]
+        grid = PixelGrid.centred(*u.shape[:2], pixel_size)
+        f, g = photographs(Path(name), row, 0)
+        found = measured(Path(name), grid, row, 0)
+    error = np.linalg.norm(found.displacement_on() - u, axis=-1) / pixel_size
+    length = np.linalg.norm(found.displacement_on(), axis=-1)
+    figure, axes = plt.subplots(1, 4, figsize=(10.0, 4.0), layout="constrained")
+    shown = (
+        (f, "reference", "gray", None), (g, "12.8 %", "gray", None),
+        (length, "|u| [mm]", "viridis", None), (error, "|error| [px]", "magma", 0.3),
+    )  # fmt: skip
+    for axis, (image, title, colours, most) in zip(axes, shown, strict=True):
+        drawn = axis.imshow(image, cmap=colours, vmin=None if most is None else 0.0, vmax=most)
+        axis.set_title(title, fontsize=9)
+        axis.axis("off")
+        if colours != "gray":
+            figure.colorbar(drawn, ax=axis, shrink=0.6)
+    figure.savefig(file, dpi=110)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--pixel-size", type=float, default=0.03, help="[mm]")
     parser.add_argument("--only", nargs="*", default=[], help="names of rows")
     parser.add_argument("--seeds", type=int, default=0, help="statistics instead, of so many seeds")
+    parser.add_argument("--picture", type=Path, help='a picture of "middle" instead')
     given = parser.parse_args()
+    if given.picture:
+        draw(given.pixel_size, given.picture)
+        return
     print(f"{given.pixel_size:g} mm/px\n")
     if given.seeds:
         heads, lines = (

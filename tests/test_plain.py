@@ -115,6 +115,19 @@ def test_distance_from_a_circle_and_its_gradient() -> None:
     assert np.allclose(np.stack(slope, axis=1), normal, atol=1e-5)
 
 
+def test_a_curve_that_is_cut_has_no_distance_beyond_its_ends() -> None:
+    t = np.linspace(0.0, np.pi, 100)
+    half = Contour(np.stack([3.0 * np.cos(t), 3.0 * np.sin(t)], axis=1), closed=False)
+    x = np.array([[0.5, 2.0], [-2.0, 2.9], [2.0, -1.5], [-3.2, -0.5]])
+    d, normal = half.distance(x)
+    assert np.allclose(d[:2], np.linalg.norm(x[:2], axis=1) - 3.0, atol=1e-6)
+    assert np.isnan(d[2:]).all()
+    assert not normal[2:].any()
+    points, step = half.evenly(0.5)
+    assert np.allclose(points[[0, -1]], [[3.0, 0.0], [-3.0, 0.0]])
+    assert np.allclose(np.linalg.norm(np.diff(points, axis=0), axis=1), step, rtol=1e-2)
+
+
 def test_moments_of_an_ellipse() -> None:
     t = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
     area, centre, second = Contour(
@@ -196,6 +209,35 @@ def test_a_buckled_specimen_without_speckle(photographed: Path) -> None:
     # Holes are flattened along x and y in turn, as the pattern has it.
     flat = [abs(HoleShape.of(hole).orientation_deg) for _, hole in matched.holes]
     assert 25 <= np.sum(np.array(flat) < 30.0) <= 35
+
+
+@pytest.mark.parametrize("part", ["plate", "middle"])
+def test_a_part_of_a_specimen_is_measured_away_from_where_it_is_cut(
+    photographed: Path, part: str
+) -> None:
+    (pair,) = make_images(Solution.read(SHIPPED), PLAIN, photographed, (0.128,))
+    px, (rows, cols) = PLAIN.pixel_size, pair.grid.shape
+    across = slice(0, int(0.6 * cols)) if part == "plate" else slice(cols // 5, cols - cols // 5)
+    along = slice(0, rows) if part == "plate" else slice(rows // 5, rows - rows // 5)
+    f, g = (
+        read_image(photographed / f"{name}_8bit.tif")[along, across]
+        for name in ("reference", "deformed_1280")
+    )
+    u, grid = pair.truth.displacement[along, across], PixelGrid.centred(*f.shape, px)
+    surface = plain_surface(f)
+    assert surface is not None
+    body = FiniteElementOptions().body(surface.mask, grid)
+    result, matched = displacement_of_plain(surface, g, grid, body)
+    assert matched.lost == 0
+    assert any(text.startswith("Not all of the specimen is in view") for text in surface.warnings)
+    found, sd = result.displacement_on(), result.standard_deviation_on()
+    there = np.isfinite(u[..., 0]) & np.isfinite(found[..., 0])
+    cell = round(1.9 / px)
+    assert not there[:, -cell // 2 :].any()
+    assert there[surface.mask].mean() > (0.7 if part == "plate" else 0.3)
+    off = np.abs(found - u)[there]
+    assert np.sqrt(np.mean(off**2)) < 0.1 * px
+    assert np.mean(off < 1.96 * sd[there]) > 0.9
 
 
 def test_measure_finds_by_itself_that_there_is_no_speckle(
@@ -292,8 +334,12 @@ def test_pictures_that_are_not_plain_or_not_whole() -> None:
     faint = gaussian_filter(rng.standard_normal(image.shape), 2.0).astype(np.float32)
     assert plain_surface(image + np.float32(0.01) * rng.standard_normal(image.shape)) is not None
     assert plain_surface(image + np.float32(0.3) * faint * (image > 0.4)) is None
-    with pytest.raises(InputError, match="all of a specimen without speckle in the picture, got"):
-        plain_surface(image[:, :100])
+    part, grid = plain_surface(image[:, :100]), PixelGrid.centred(132, 100, 1.0)
+    assert part is not None
+    assert len(part.contours) == 2  # holes that are all in view
+    assert len(part.cut) == 3
+    with pytest.raises(InputError, match=r"2 holes in .* of which not all is in view, found 0"):
+        matched_contours(part, part, grid)
     surface = plain_surface(image)
     assert surface is not None
     grid = PixelGrid.centred(*image.shape, 1.0)

@@ -11,6 +11,11 @@ decide; where the law is right free edges have no traction, and the springs carr
 wrong law does is therefore small, and estimated: by how much laws of other compressibility change
 u. An edge that is straight and stays so is taken to be held by a plate on which it doesn't slide.
 Contours don't show whether it does; what sliding would change counts in the standard deviation.
+
+Where an image's border cuts the body, unknown tractions hold it. Over each ligament that is cut, or
+piece of one cut lengthwise, they have two resultants and a moment, which are found as those with
+which the springs carry least. Other tractions there matter nearby (Saint-Venant), and count in the
+standard deviation as if they were as large as stress in the body is.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from functools import partial
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh, boundary_sides
@@ -29,7 +35,7 @@ from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.idic.finite_element.cutoff import Deviations
 from modeharvest.idic.finite_element.fields import interpolation_error, nodal_gradient
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.finite_element.system import SAMPLES, Body, Imbalance
+from modeharvest.idic.finite_element.system import SAMPLES, SOME, Body, Imbalance
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.contour import Contour, SeenContours
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
@@ -46,6 +52,15 @@ _PLATE = 1e6
 """Stiffness along edges that don't slide [shear modulus times px]."""
 _FAR_PX = 3.0
 """The mesh's edge is off the contour of the reference by less, or that contour is not known."""
+_CUT_PX = 5.0
+"""Sides of elements whose middle is nearer to the image's border are cut by it: the boundary of a
+mask is rounded off there."""
+_MOST_SIDES = 4
+"""Of elements in one piece of a cut, whose tractions have two resultants and a moment."""
+_SHOWN = 3.0
+"""Share of the variance of the contours' noise that springs, which give way, show [-]."""
+_ROUNDS, _LONGEST_PX = 3, 8.0
+"""Of the tractions at cut sides, and what they move a node by in one step, at most."""
 _CORNER = np.deg2rad(35.0)
 _LEAST_SIDE, _STRAIGHT, _STAYS_STRAIGHT = 0.2, 2e-3, 5e-3
 """Length of a straight edge over that of the body, at least, and how far off a straight line it
@@ -55,7 +70,7 @@ _LOADED = 0.3
 _GAUSS, _WEIGHTS = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6), np.array([5, 8, 5]) / 18.0
 _ROUGH_PX, _TOLERANCE_PX, _STEPS = 1.0, 0.01, 60
 _LEAST_DET = 0.02
-_PROBES = 4
+_PROBES, _TINY = 4, 1e-200
 _ASTRAY = (
     "The displacement from contours didn't converge: don't use it; give pictures in between, or of "
     "more pixels across notches and slits."
@@ -68,8 +83,8 @@ of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
 class _Edge:
     """The points of a mesh's edge that are held to contours."""
 
-    def __init__(self, mesh: Mesh, seen: SeenContours, pixel_size: float) -> None:
-        t = _GAUSS
+    def __init__(self, mesh: Mesh, seen: SeenContours, grid: PixelGrid) -> None:
+        t, pixel_size = _GAUSS, grid.pixel_size
         N = np.stack([(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)], axis=1)
         dN = np.stack([4 * t - 3, 4 - 8 * t, 4 * t - 1], axis=1)
         sides = boundary_sides(mesh)
@@ -85,8 +100,12 @@ class _Edge:
         number = np.repeat(np.arange(len(seen.reference)), [len(c.points) for c in seen.reference])
         self.number, self.deformed = number[cKDTree(every).query(self.points)[1]], seen.deformed
         self.off: FloatArray = np.zeros(len(self.points))
-        self.off, _ = self._distances(self.points, seen.reference)
-        self.length[np.abs(self.off) > _FAR_PX * pixel_size] = 0.0
+        off, _ = self._distances(self.points, seen.reference)
+        self.off = np.nan_to_num(off)
+        self.cut = _cut_ligaments(mesh, sides, grid).repeat(t.size)
+        """(q,) number of the ligament that the image's border cuts, from 0; -1 elsewhere."""
+        self.whole_length = self.length.copy()
+        self.length[~(np.abs(off) < _FAR_PX * pixel_size) | (self.cut >= 0)] = 0.0
 
     def _distances(
         self, x: FloatArray, contours: Sequence[Contour]
@@ -97,9 +116,37 @@ class _Edge:
             d[own], normal[own] = contour.distance(x[own])
         return d - self.off, normal
 
+    def loads(self, tractions: FloatArray) -> FloatArray:
+        """(2 n, k) nodal forces of tractions (q, 2, k) [N/mm]."""
+        parts = (self.whole_length[:, None, None] * tractions).reshape(len(self.points), -1)
+        return np.asarray(self.shapes.T @ parts).reshape(2 * self.shapes.shape[1], -1)
+
+    def on_cuts(self) -> tuple[FloatArray, FloatArray]:
+        """(q, 2, 3 c) tractions on c cut ligaments: their forces and moments, and uneven ones."""
+        c = int(self.cut.max()) + 1
+        own, other = (np.zeros((len(self.points), 2, 3 * c)) for _ in range(2))
+        for k in range(c):
+            at, share = self.cut == k, self.whole_length[self.cut == k]
+            x = self.points[at] - np.average(self.points[at], axis=0, weights=share)
+            s = x @ np.linalg.svd(x, full_matrices=False)[2][0]
+            s /= max(float(np.abs(s).max()), 1e-12)
+            own[at, 0, 3 * k] = own[at, 1, 3 * k + 1] = 1.0
+            turn = x[:, ::-1] * [-1.0, 1.0]
+            own[at, :, 3 * k + 2] = turn / max(float(np.abs(turn).max()), 1e-12)
+            uneven = s**2 - np.average(s**2, weights=share)
+            other[at, 0, 3 * k] = other[at, 1, 3 * k + 1] = uneven
+            other[at, :, 3 * k + 2] = own[at, ::-1, 3 * k + 2]  # along the cut
+            square = np.average((other[at] ** 2).sum(axis=1), axis=0, weights=share)
+            other[at] /= np.sqrt(np.maximum(square, _TINY))  # of size 1, as the forces
+        return own, other
+
     def distances(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(q,) signed distances [mm] at displacements (n, 2), (q, 2) their gradients."""
-        return self._distances(self.points + self.shapes @ u, self.deformed)
+        """(q,) signed distances [mm] at displacements (n, 2), (q, 2) their gradients.
+
+        Both are 0 where a point has left the image.
+        """
+        d, normal = self._distances(self.points + self.shapes @ u, self.deformed)
+        return np.nan_to_num(d), normal
 
     def normal_shapes(self, normal: FloatArray) -> csr_array:
         """(q, 2 n) what displacements are along the normals (q, 2)."""
@@ -109,6 +156,24 @@ class _Edge:
         return csr_array(
             (data.ravel(), cols.ravel(), 2 * shapes.indptr), (len(normal), 2 * shapes.shape[1])
         )
+
+
+def _cut_ligaments(mesh: Mesh, sides: IntArray, grid: PixelGrid) -> IntArray:
+    """(s,) which cut of a ligament each side (s, 3) of the mesh's edge is part of; -1 of none."""
+    left, right, bottom, top = grid.extent
+    x, y = mesh.nodes[sides[:, 1]].T
+    from_border = np.min([x - left, right - x, y - bottom, top - y], axis=0)
+    near = from_border < _CUT_PX * grid.pixel_size
+    own, size = sides[near], len(mesh.nodes)
+    joined = csr_array((np.ones(len(own)), (own[:, 0], own[:, 2])), shape=(size, size))
+    _, of_node = connected_components(joined, directed=False)
+    key, number = of_node[own[:, 0]] * len(sides), np.full(len(sides), -1)
+    for k in np.unique(key):  # cut lengthwise, in pieces
+        x = mesh.nodes[own[key == k, 1]]
+        along = (x - x.mean(axis=0)) @ np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2][0]
+        key[key == k] += along.argsort().argsort() // _MOST_SIDES
+    number[near] = np.unique(key, return_inverse=True)[1]
+    return number
 
 
 def straight_sides(mesh: Mesh) -> tuple[IntArray, ...]:
@@ -150,8 +215,8 @@ class _PenalisedBody:
     def __init__(
         self, body: Body, seen: SeenContours, grid: PixelGrid, law: Material, start: FloatArray
     ) -> None:
-        self.mesh, self.px = body.mesh, grid.pixel_size
-        self.edge = _Edge(body.mesh, seen, self.px)
+        self.mesh, self.px, self.noise = body.mesh, grid.pixel_size, seen.noise
+        self.edge = _Edge(body.mesh, seen, grid)
         if not self.edge.length.any():
             raise InputError("expected contours at the mesh's edge, got none")
         self.u: FloatArray = start.ravel().copy()
@@ -159,6 +224,10 @@ class _PenalisedBody:
         self._use(law)
         _, self._first = self.law.forces(0.0 * self.u)
         self.stiffness = 0.0
+        own, other = self.edge.on_cuts()
+        self.loads, self.uneven = self.edge.loads(own), self.edge.loads(other)
+        """(2 n, 3 c) forces of tractions of 1 at cuts [mm]: of their resultants, and of others."""
+        self.tractions: FloatArray = np.zeros(own.shape[2])
         self.plates = csr_array((0, self.u.size))
         self.stretched: FloatArray = np.zeros(0)
         self.pressed: list[BoolArray] = []
@@ -181,7 +250,8 @@ class _PenalisedBody:
         springs = self.stiffness * float(self.edge.length @ d**2)
         plates = self.plates @ u + self.stretched
         own = float(W @ np.broadcast_to(self.law.weights, F.shape[:2]).ravel())
-        return own / self.shear + 0.5 * (springs + float(plates @ plates))
+        work = float(u @ (self.loads @ self.tractions))
+        return own / self.shear + 0.5 * (springs + float(plates @ plates)) - work
 
     def linearised(self) -> tuple[csr_array, csr_array, FloatArray]:
         """(2 n, 2 n) tangent stiffness, that of the springs in it, (2 n,) forces, all over mu."""
@@ -191,6 +261,7 @@ class _PenalisedBody:
         weighed = diags_array(self.stiffness * self.edge.length) @ B
         D, springs = self.plates, csr_array(B.T @ weighed)
         forces = f / self.shear + weighed.T @ d + D.T @ (D @ self.u + self.stretched)
+        forces = forces - self.loads @ self.tractions
         return csr_array(K / self.shear + springs + D.T @ D), springs, forces
 
     def factor(self, A: csr_array) -> Factor:
@@ -226,6 +297,43 @@ class _PenalisedBody:
             damping *= 0.2
         return False
 
+    def settle(self, springs: float, tolerance_px: float) -> bool:
+        """Relax, and find the tractions at cuts with which the springs carry least."""
+        converged = self.relax(springs, tolerance_px)
+        for _ in range(_ROUNDS if self.tractions.size else 0):
+            A, _, _ = self.linearised()
+            d, normal = self.edge.distances(self.u.reshape(-1, 2))
+            by_tractions, answer, kept = self.answers(self.factor(A), normal)
+            more = answer @ d - kept @ self.tractions
+            step = by_tractions @ more
+            share = min(1.0, _LONGEST_PX * self.px / max(float(np.abs(step).max()), 1e-300))
+            while not np.isfinite(self.energy(self.u + share * step)):
+                share *= 0.5
+            self.tractions, self.u = self.tractions + share * more, self.u + share * step
+            converged = self.relax(springs, tolerance_px)
+        return converged
+
+    def answers(self, factor: Factor, normal: FloatArray) -> tuple[FloatArray, ...]:
+        """(2 n, 3 c) u by tractions at cuts; (3 c, q) how these follow from distances; (3 c, 3 c).
+
+        The last is what is left of tractions that contours don't show: as large as stress is (rms),
+        these are as likely as distances as large as their noise.
+        """
+        by_tractions = factor.solve(self.loads)
+        D = self.edge.normal_shapes(normal) @ by_tractions
+        weighed, ridge = D.T * self.edge.length, _SHOWN * self.noise / self.stress() ** 2
+        square = weighed @ D + ridge * np.eye(D.shape[1])
+        kept = ridge * np.linalg.inv(square)
+        return by_tractions, -np.linalg.solve(square, weighed), kept
+
+    def stress(self) -> float:
+        """Rms of a component of the first Piola-Kirchhoff stress over the body, over mu [-]."""
+        cells = self.u.reshape(-1, 2)[self.mesh.cells]
+        F = np.eye(2) + np.einsum("eai,eqaj->eqij", cells, self.law.slopes)
+        P = stress_and_tangent(self.law.material, F.reshape(-1, 2, 2))[0] / self.shear
+        weights = np.broadcast_to(self.law.weights, F.shape[:2]).ravel()
+        return float(np.sqrt(np.average((P**2).mean(axis=(1, 2)), weights=weights)))
+
     def pressed_sides(self) -> tuple[IntArray, ...]:
         """The straight edges that something presses or pulls."""
         d, normal = self.edge.distances(self.u.reshape(-1, 2))
@@ -234,7 +342,8 @@ class _PenalisedBody:
         sides, tractions = [], []
         for nodes in straight_sides(self.mesh):
             own = np.isin(first, nodes) & (self.edge.length > 0.0)
-            if own.any() and _bend(seen[own]) < _STAYS_STRAIGHT:
+            tied = 2 * own.sum() > np.isin(first, nodes).sum()
+            if tied and _bend(seen[own]) < _STAYS_STRAIGHT:
                 sides.append(nodes)
                 tractions.append(abs(np.average(d[own], weights=self.edge.length[own])))
         most = max(tractions, default=0.0)
@@ -274,7 +383,32 @@ class _PenalisedBody:
         if slides:
             other.plates, other.stretched = self.plates[:0], self.stretched[:0]
         A, _, forces = other.linearised()
-        return self.factor(A).solve(-forces).reshape(-1, 2)
+        factor = self.factor(A)
+        return self.with_tractions(factor.solve(-forces)[:, None], factor).reshape(-1, 2)
+
+    def with_tractions(
+        self, u: FloatArray, factor: Factor, noise: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """(2 n, k) changes u with those of the tractions at cuts that follow from them.
+
+        ``noise`` (q, k): of the contours' distances, beside what u changes them by [mm].
+        """
+        if not self.tractions.size:
+            return u
+        _, normal = self.edge.distances(self.u.reshape(-1, 2))
+        by_tractions, answer, _ = self.answers(factor, normal)
+        off = self.edge.normal_shapes(normal) @ u - noise
+        return np.asarray(u + by_tractions @ (answer @ off))
+
+    def by_other_tractions(self, factor: Factor, count: int) -> FloatArray:
+        """(n, 2, count) what random tractions at cuts do, uneven or not shown by contours."""
+        _, normal = self.edge.distances(self.u.reshape(-1, 2))
+        by_tractions, _, kept = self.answers(factor, normal)
+        z = self.stress() * np.random.default_rng(1).standard_normal(
+            (2, self.tractions.size, count)
+        )
+        uneven = self.with_tractions(factor.solve(self.uneven @ z[0]), factor)
+        return np.asarray(uneven + by_tractions @ (kept @ z[1])).reshape(-1, 2, count)
 
 
 def displacement_from_contours(
@@ -304,15 +438,15 @@ def displacement_from_contours(
     soft, stiff = _SPRINGS
     step = partial(progress, total=3, what="displacement from contours")
     step(0)
-    state.relax(soft, _ROUGH_PX)
+    state.settle(soft, _ROUGH_PX)
     sides = state.pressed_sides()
     state.press(sides, slides=slides)
     step(1)
-    state.relax(soft, 10.0 * _TOLERANCE_PX)
+    state.settle(soft, 10.0 * _TOLERANCE_PX)
     before = state.u
     step(2)
     state.take_up(stiff / soft)
-    converged = state.relax(stiff, _TOLERANCE_PX)
+    converged = state.settle(stiff, _TOLERANCE_PX)
     step(3)
     u, mesh = state.u.reshape(-1, 2), body.mesh
     left = np.asarray(state.u - before).reshape(-1, 2) * (soft / (stiff - soft))
@@ -350,9 +484,11 @@ def _deviations(
     weighed = diags_array(state.stiffness * np.sqrt(edge.length * noise)) @ edge.normal_shapes(
         normal
     )
-    random = weighed.T @ rng.standard_normal((len(normal), SAMPLES))
-    z = rng.choice([-1.0, 1.0], (state.u.size, _PROBES))
-    found = state.factor(A).solve(np.column_stack([random, springs @ z]))
+    drawn = rng.standard_normal((len(normal), SAMPLES))
+    z, factor = rng.choice([-1.0, 1.0], (state.u.size, _PROBES)), state.factor(A)
+    found = factor.solve(np.column_stack([weighed.T @ drawn, springs @ z]))
+    off = np.sqrt(noise / np.maximum(edge.length, _TINY))[:, None] * drawn
+    found[:, :SAMPLES] = state.with_tractions(found[:, :SAMPLES], factor, off)
     known = float(np.sum(z * found[:, SAMPLES:])) / _PROBES
     samples = found[:, :SAMPLES].reshape(-1, 2, SAMPLES)
     slopes = nodal_gradient(mesh, samples.reshape(len(samples), -1)).reshape(-1, 2, SAMPLES, 2)
@@ -361,9 +497,12 @@ def _deviations(
     none = samples[..., :0]
     sd = Deviations(samples, none, none, error, spread).with_bias(mesh, left)
     changes = []
+    if state.tractions.size:
+        others = state.by_other_tractions(factor, SOME)
+        changes = list(np.moveaxis(others, 2, 0) / np.sqrt(SOME))
     if law_is_assumed:
         laws = (Ogden(ELASTOMER.moduli, ELASTOMER.exponents, k) for k in (_SOFTER, _STIFFER))
-        changes = [state.change_by(other) / np.sqrt(2.0 * _TRIANGULAR) for other in laws]
+        changes += [state.change_by(other) / np.sqrt(2.0 * _TRIANGULAR) for other in laws]
     if may_slide:
         changes.append(state.change_by(slides=True) / np.sqrt(_RECTANGULAR))
     for change in changes:

@@ -17,8 +17,10 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter, label
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import savgol_filter
+from scipy.spatial import cKDTree
 from skimage.filters import threshold_otsu
 
+from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.contours import displacement_from_contours
 from modeharvest.idic.finite_element.mesh import find_contours
 from modeharvest.idic.finite_element.result import NodalResult, WholeField, refitted
@@ -35,6 +37,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic
 from modeharvest.util.masks import large_parts, shrunk
 from modeharvest.util.progress import Progress, silent
+from modeharvest.util.typed import picked
 
 _BLUR_PX = 0.7
 _CORRELATED_PX = 2.0 * np.sqrt(np.pi) * _BLUR_PX
@@ -61,6 +64,10 @@ _SHARPEST = 1.0 / 3.0
 """Largest curvature [1/px]: that of a corner is no radius."""
 _LEAST_PX2 = 60.0
 """Area of a hole or island; smaller ones are dirt."""
+_CLEAR = 0.02
+"""Share of the picture's border that dirt may be taken for."""
+_SHORTEST_CUT = 24
+"""Points of a contour that ends at the picture's border, at least: corners of others are no use."""
 _SECOND = 0.2
 """Area over the largest one's from which on another island is a specimen."""
 _TURNS_DEG = np.arange(-24.0, 25.0, 6.0)
@@ -69,6 +76,14 @@ _CONTOURS = (
     "No speckle: the displacement is that of a hyperelastic body held to its contours, and the "
     "ansatz is fitted to it."
 )
+_CUT = (
+    "Not all of the specimen is in view: what holds it where the picture cuts it isn't known, so "
+    "that nothing is said within a hole's distance of there."
+)
+_LEFT = "Some of the specimen has left the picture: what is there follows from a law alone."
+_GROWING = np.array([4.0, 6.0, 9.0, 14.0, 20.0, 30.0, np.inf, np.inf])
+"""How far from the middle of a picture holes are matched in turn, over the reach of a match: the
+next is where those before say that it is."""
 _ALIKE = 0.4
 """Share of the distance to the next hole within which a hole is looked for."""
 
@@ -80,21 +95,28 @@ class PlainSurface:
     mask: BoolArray
     """(rows, cols) True on material."""
     contours: tuple[FloatArray, ...]
-    """(n, 2) points (row, col) [px] of each, the outer one of the material first, then those of its
-    holes."""
+    """(n, 2) points (row, col) [px] of each closed one: the outer one of the material first, if all
+    of it is in view, then those of its holes."""
     noise: float
     """Variance of a contour's distance times the length over which it is correlated [px^3]."""
     warnings: tuple[str, ...] = ()
-    """Whether there are other specimens in the picture."""
+    """Whether there are other specimens in the picture, and whether all of this one is."""
+    cut: tuple[FloatArray, ...] = ()
+    """Those that the picture's border cuts; none if all of the specimen is in view."""
+
+    def on(self, grid: PixelGrid) -> tuple[list[Contour], list[Contour], list[Contour]]:
+        """Outer contours, those of holes, and those that are cut, in a grid's frame [mm]."""
+        closed = [Contour(np.column_stack(grid.to_mm(*points.T))) for points in self.contours]
+        cut = [Contour(np.column_stack(grid.to_mm(*points.T)), False) for points in self.cut]
+        outer = 0 if cut else 1
+        return closed[:outer], closed[outer:], cut
 
 
-def plain_surface(
-    image: FloatImage, name: str = "the picture", like: BoolArray | None = None
-) -> PlainSurface | None:
+def plain_surface(image: FloatImage, like: BoolArray | None = None) -> PlainSurface | None:
     """What a picture (rows, cols) shows if it shows a plain material; None if it has speckle.
 
-    Of several specimens the largest is taken, or the one where ``like`` is True. InputError, in
-    which the picture has a name, if the specimen reaches its border.
+    Of several specimens the largest is taken, or the one where ``like`` is True. One that reaches
+    the picture's border is in view in part: its contours end there.
     """
     grey = gaussian_filter(np.asarray(image, dtype=np.float32), _BLUR_PX)
     few = max(1, min(grey.shape) // _COARSE_PX)
@@ -102,28 +124,24 @@ def plain_surface(
     if found is None:
         return None
     bright, middle, step = found
-    border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]])
-    material = large_parts(bright if border.mean() < 0.5 else ~bright, _LEAST_PX2)
+    material = large_parts(bright if _is_material(bright) else ~bright, _LEAST_PX2)
     if not material.any() or _shows_speckle(image, material, step):
         return None
     material, text = _one_specimen(material | ~large_parts(~material, _LEAST_PX2), like)
-    reached = sum(int(side.sum()) for side in (*material[[0, -1]], *material[:, [0, -1]].T))
-    if reached:
-        raise InputError(
-            f"expected all of a specimen without speckle in {name}, got material at "
-            f"{reached} px of its border; take it from farther away, or crop nothing"
-        )
-    contours = closed_contours(grey - middle, material)
+    contours, cut = contours_around(grey - middle, material)
     if not contours:
         return None
-    slope = _slope(grey, contours)
+    if cut:
+        text += (_CUT,)
+    slope = _slope(grey, contours + cut)
     # White noise of the pixels, blurred: its variance at a point times its correlation length.
     noise = estimated_noise(image, material).sd ** 2 / _CORRELATED_PX
     # The slope of a straight edge says how far the lens, the pixels and this have blurred it.
     blur = float(np.abs(step[material]).mean()) / (slope * np.sqrt(2.0 * np.pi))
     variance = max(0.0, blur**2 - _DIFFERENCE_PX2)
-    sharp = tuple(_unbent(points, variance) for points in contours)
-    return PlainSurface(material, sharp, noise / slope**2, text)
+    sharp = tuple(_unbent(Contour(points), variance) for points in contours)
+    ends = tuple(_unbent(Contour(points, False), variance) for points in cut)
+    return PlainSurface(material, sharp, noise / slope**2, text, ends)
 
 
 def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | None:
@@ -143,16 +161,34 @@ def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | 
     return bright, 0.5 * (above + below), above - below
 
 
-def closed_contours(signed: FloatArray, material: BoolArray) -> tuple[FloatArray, ...]:
-    """Closed contours (n, 2) at 0 around a material, the longest first."""
-    found = []
+def _is_material(bright: BoolArray) -> bool:
+    """Whether the material is bright: what isn't at the picture's border.
+
+    Where both are there, it is what is in fewer parts, because holes are many.
+    """
+    border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]]).mean()
+    parts = [label(large_parts(side, _LEAST_PX2))[1] for side in (bright, ~bright)]
+    if _CLEAR < border < 1.0 - _CLEAR and parts[0] != parts[1]:
+        return bool(parts[0] < parts[1])
+    return bool(border < 0.5)
+
+
+def contours_around(
+    signed: FloatArray, material: BoolArray
+) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+    """Contours (n, 2) at 0 around a material: closed ones, the longest first, and those cut."""
+    closed, cut = [], []
     for points in find_contours(signed.astype(np.float64), 0.0):
         row, col = np.rint(points[len(points) // 2]).astype(int)
         around = np.s_[max(0, row - 2) : row + 3, max(0, col - 2) : col + 3]
-        closed = len(points) > 8 and np.allclose(points[0], points[-1])
-        if closed and material[around].any() and abs(signed_area(points)) > _LEAST_PX2:
-            found.append(points[:-1])
-    return tuple(sorted(found, key=lambda points: -abs(signed_area(points))))
+        if len(points) <= 8 or not material[around].any():
+            continue
+        if not np.allclose(points[0], points[-1]):
+            if len(points) > _SHORTEST_CUT:
+                cut.append(points)
+        elif abs(signed_area(points)) > _LEAST_PX2:
+            closed.append(points[:-1])
+    return tuple(sorted(closed, key=lambda points: -abs(signed_area(points)))), tuple(cut)
 
 
 def _one_specimen(material: BoolArray, like: BoolArray | None) -> tuple[BoolArray, tuple[str, ...]]:
@@ -199,15 +235,16 @@ def _shows_speckle(image: FloatImage, material: BoolArray, step: FloatArray) -> 
     return bool(alike > _ALIKE_GREY)
 
 
-def _unbent(points: FloatArray, variance: float) -> FloatArray:
-    """A contour (n, 2) less what a blur of that variance [px^2] has moved it, 1/2R times that.
+def _unbent(contour: Contour, variance: float) -> FloatArray:
+    """(n, 2) points of a contour less what a blur of a variance [px^2] moved it, 1/2R times that.
 
     To the centre of curvature, that is, of the contour before the blur: found by iteration.
     """
-    seen, step = Contour(points).evenly(_EVERY_PX)
-    found, window = seen, 2 * round(_CURVED_PX / step) + 1
+    seen, step = contour.evenly(_EVERY_PX)
+    found, window = seen, min(2 * round(_CURVED_PX / step) + 1, (len(seen) - 1) | 1)
+    how = "wrap" if contour.closed else "interp"
     for _ in range(_SHARPENED):
-        bent = savgol_filter(found, min(window, len(seen)), 5, 2, step, axis=0, mode="wrap")
+        bent = savgol_filter(found, min(window, len(seen)), 5, 2, step, axis=0, mode=how)
         length = np.linalg.norm(bent, axis=1, keepdims=True)
         found = seen - 0.5 * variance * bent * np.minimum(1.0, _SHARPEST / np.maximum(length, 1e-9))
     return np.asarray(found)
@@ -232,6 +269,11 @@ class MatchedContours:
     lost: int
     """Holes of the reference that weren't found in the deformed picture."""
 
+    @property
+    def centres(self) -> list[FloatArray]:
+        """Of the holes in the reference [mm]."""
+        return [hole.moments[1] for hole, _ in self.holes]
+
     def start(self, points: FloatArray) -> FloatArray:
         """(n, 2) displacement of points (n, 2) [mm] by the affine motion."""
         return np.column_stack([points, np.ones(len(points))]) @ self.affine
@@ -242,35 +284,62 @@ def matched_contours(
 ) -> MatchedContours:
     """Find each contour of a picture again in another one.
 
-    InputError if fewer than half of the holes are found.
+    InputError if fewer than half of the holes are found, or fewer than three in a part of a
+    specimen. Contours that are cut are looked for where the holes' affine motion takes them.
     """
-    f, g = (
-        [Contour(np.column_stack(grid.to_mm(*points.T))) for points in surface.contours]
-        for surface in (reference, deformed)
-    )
-    outer, holes, others = (f[0], g[0]), f[1:], g[1:]
-    a = np.array([contour.moments[1] for contour in f])
-    b = np.array([contour.moments[1] for contour in g])
-    pairs = _paired(a[1:], b[1:]) if len(holes) > 2 and len(others) > 2 else []
-    if 2 * len(pairs) < len(holes):
+    (outer, holes, cut), (outer_g, others, cut_g) = reference.on(grid), deformed.on(grid)
+    whole = bool(outer and outer_g)
+    a = np.array([hole.moments[1] for hole in holes]).reshape(-1, 2)
+    b = np.array([hole.moments[1] for hole in others]).reshape(-1, 2)
+    pairs = _paired(a, b, whole) if len(holes) > 2 and len(others) > 2 else []
+    if 2 * len(pairs) < len(holes) or not (whole or len(pairs) > 2):
+        part = "," if whole else ", of which not all is in view,"
         raise InputError(
-            f"expected the reference's {len(holes)} holes in the deformed picture, found "
+            f"expected the reference's {len(holes)} holes in the deformed picture{part} found "
             f"{len(pairs)} of them among {len(others)}; give pictures in "
             "between, or of one and the same specimen"
         )
     found = tuple((holes[i], others[j]) for i, j in pairs)
     if len(pairs) < 3:
-        sizes = [np.sqrt(np.diag(contour.moments[2])) for contour in outer]
-        linear = np.diag(sizes[1] / sizes[0])
-        affine = np.vstack([linear - np.eye(2), b[0] - a[0] @ linear])
+        (centre, second), (centre_g, second_g) = (c[0].moments[1:] for c in (outer, outer_g))
+        linear = np.diag(np.sqrt(np.diag(second_g)) / np.sqrt(np.diag(second)))
+        affine = np.vstack([linear - np.eye(2), centre_g - centre @ linear])
     else:
-        at = 1 + np.array(pairs).T
-        affine = _affine(a[at[0]], b[at[1]])
-    every = (outer, *found)
+        i, j = np.array(pairs).T
+        affine = _affine(a[i], b[j])
+    left = [hole for k, hole in enumerate(holes) if k not in dict(pairs)]
+    taken = {j for _, j in pairs}
+    left_g = [hole for k, hole in enumerate(others) if k not in taken]
+    rest, rest_g = [*cut, *left, *outer], [*cut_g, *left_g, *outer_g]
+    arcs = () if whole else _paired_arcs(rest, rest_g, affine, _ALIKE * _spacing(a))
+    every = (*zip(outer, outer_g, strict=False), *found) if whole else (*found, *arcs)
     noise = (reference.noise + deformed.noise) * grid.pixel_size**3
     sides = tuple(c for c, _ in every), tuple(c for _, c in every)
     seen = SeenContours(*sides, noise, _CORRELATED_PX * grid.pixel_size)
-    return MatchedContours(seen, affine, found, len(holes) - len(found))
+    lost = len(left) - sum(any(c is hole for hole in left) for c, _ in arcs)
+    return MatchedContours(seen, affine, found, lost)
+
+
+def _paired_arcs(
+    f: Sequence[Contour], g: Sequence[Contour], affine: FloatArray, reach: float
+) -> tuple[tuple[Contour, Contour], ...]:
+    """Of contours in two pictures those that are the same, one at least of each pair being cut."""
+    trees, found = [cKDTree(contour.points) for contour in g], []
+    for contour in f:
+        x = np.column_stack([contour.points, np.ones(len(contour.points))])
+        x = contour.points + x @ affine
+        far = [
+            float(np.median(tree.query(x)[0])) if not (contour.closed and other.closed) else np.inf
+            for tree, other in zip(trees, g, strict=True)
+        ]
+        if far and min(far) < reach:
+            found.append((contour, g[int(np.argmin(far))]))
+    return tuple(found)
+
+
+def _spacing(a: FloatArray) -> float:
+    """Median distance of points (n, 2) to their nearest."""
+    return float(np.median(cKDTree(a).query(a, k=2)[0][:, 1]))
 
 
 def _affine(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -278,32 +347,38 @@ def _affine(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(np.column_stack([a, np.ones(len(a))]), b - a)[0])
 
 
-def _paired(a: FloatArray, b: FloatArray) -> list[tuple[int, int]]:
-    """Which of the points a (n, 2) is which of b (m, 2), turned, stretched and shifted."""
-    near = np.linalg.norm(a[:, None] - a, axis=2) + 1e9 * np.eye(len(a))
-    reach = _ALIKE * float(np.median(near.min(axis=1)))
+def _paired(a: FloatArray, b: FloatArray, whole: bool) -> list[tuple[int, int]]:
+    """Which of the points a (n, 2) is which of b (m, 2), turned, stretched and shifted.
+
+    Where not all is in view, those in the middle have moved by less than 0.4 of their spacing.
+    """
+    reach = _ALIKE * _spacing(a)
+    there, far = (_laid_over(a, b, reach), [np.inf] * _ROUNDS) if whole else (a, _GROWING * reach)
+    pairs = np.empty((0, 2), dtype=np.int64)
+    for radius in far:
+        distance = np.linalg.norm(there[:, None] - b, axis=2)
+        i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
+        ok = (distance[i, j] < reach) & (np.linalg.norm(a[i], axis=1) < radius)
+        pairs = np.stack([i[ok], j[ok]], axis=1)
+        if len(pairs) > 2:
+            there = a + np.column_stack([a, np.ones(len(a))]) @ _affine(a[i[ok]], b[j[ok]])
+    return [(int(i), int(j)) for i, j in pairs]
+
+
+def _laid_over(a: FloatArray, b: FloatArray, reach: float) -> FloatArray:
+    """Points a (n, 2) turned, stretched and shifted so that they lie upon b (m, 2), about."""
     best: tuple[float, FloatArray] = (np.inf, a)
     for turn in np.deg2rad(_TURNS_DEG):
         back = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         upright = (b - b.mean(axis=0)) @ back
         centred = a - a.mean(axis=0)
         scale = upright.std(axis=0) / np.maximum(centred.std(axis=0), 1e-12)
-        there = (centred * np.where(centred.std(axis=0) > 0.0, scale, 1.0)) @ back.T + b.mean(
-            axis=0
-        )
-        distance = np.linalg.norm(there[:, None] - b, axis=2)
-        cost = float(np.minimum(distance.min(axis=1), reach).sum())
+        stretched = centred * np.where(centred.std(axis=0) > 0.0, scale, 1.0)
+        there = stretched @ back.T + b.mean(axis=0)
+        distance = cKDTree(b).query(there)[0]
+        cost = float(np.minimum(distance, reach).sum())
         best = min(best, (cost, there), key=lambda found: found[0])
-    there = best[1]
-    for _ in range(3):
-        distance = np.linalg.norm(there[:, None] - b, axis=2)
-        i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
-        ok = distance[i, j] < reach
-        i, j = i[ok], j[ok]
-        if len(i) < 3:
-            break
-        there = a + np.column_stack([a, np.ones(len(a))]) @ _affine(a[i], b[j])
-    return list(zip(i.tolist(), j.tolist(), strict=True))
+    return best[1]
 
 
 def displacement_of_plain(
@@ -319,7 +394,7 @@ def displacement_of_plain(
     ``body``: a mesh of the reference's material. InputError, in which the picture has a name, if it
     shows no plain specimen, or another one.
     """
-    deformed = plain_surface(image, name, reference.mask)
+    deformed = plain_surface(image, reference.mask)
     if deformed is None:
         raise InputError(
             f"expected two grey levels in {name}, like the reference's, got more: a plain specimen "
@@ -328,10 +403,35 @@ def displacement_of_plain(
     matched = matched_contours(reference, deformed, grid)
     start = matched.start(body.mesh.nodes)
     found = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
+    if reference.cut:
+        found = _away_from_cuts(found, reference.mask, _spacing(np.array(matched.centres)))
     if matched.lost:
         lost = f"{matched.lost} holes weren't found again: what is around them follows from a law."
         found = replace(found, warnings=(*found.warnings, lost))
+    if deformed.cut and not reference.cut:
+        found = replace(found, warnings=(*found.warnings, _LEFT))
     return found, matched
+
+
+def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
+    """What is farther than so much [mm] from where a picture cuts the material (rows, cols)."""
+    border = np.zeros_like(mask)
+    border[[0, -1]] = border[:, [0, -1]] = True
+    cut = np.column_stack(found.grid.to_mm(*np.nonzero(mask & border)))
+    mesh = found.mesh
+    far = cKDTree(cut).query(mesh.nodes)[0] > reach
+    cells = mesh.cells[far[mesh.cells].all(axis=1)]
+    if not cells.size:
+        raise InputError(
+            "expected a specimen without speckle of which more is in view than a cell beside the "
+            "picture's border, got less; take it from farther away"
+        )
+    kept = np.unique(cells)
+    nodal = "displacement start standard_deviation noise_deviation gradient_covariance roots"
+    parts = {name: part[kept] for name, part in picked(found, nodal).items()}
+    return replace(
+        found, mesh=Mesh(mesh.nodes[kept], np.searchsorted(kept, cells), mesh.element), **parts
+    )
 
 
 def measure_contours(

@@ -22,7 +22,7 @@ from modeharvest.idic.finite_element.contours import displacement_from_contours
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import refitted
 from modeharvest.idic.finite_element.system import SAMPLES, Body
-from modeharvest.idic.photograph.plain import PlainSurface, closed_contours, matched_contours
+from modeharvest.idic.photograph.plain import PlainSurface, contours_around, matched_contours
 from modeharvest.idic.result import Covariance, Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
@@ -79,7 +79,7 @@ def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> Pla
     if mask[[0, -1]].any() or mask[:, [0, -1]].any():
         raise InputError("contours: expected all of the specimen in the picture, got a part of it")
     share, weight = _share_of_material(np.asarray(image, np.float32), mask)
-    found = closed_contours(share - 0.5, mask)
+    found, _ = contours_around(share - 0.5, mask)
     areas = [abs(Contour(points).moments[0]) for points in found]
     least = _LEAST_HOLE * float(np.median(areas[1:])) if len(areas) > 1 else 0.0
     width = _SMOOTHED * max(4.0, cell_px / ELEMENTS_A_CELL)

@@ -1,4 +1,4 @@
-"""Contours in photographs: smooth closed curves, the distance of points from them, their shapes."""
+"""Contours in photographs: smooth curves, the distance of points from them, shapes of holes."""
 
 from __future__ import annotations
 
@@ -22,21 +22,23 @@ def signed_area(points: FloatArray) -> float:
 
 
 class Contour:
-    """A closed smooth curve through points (n, 2) [mm], each once."""
+    """A smooth curve through points (n, 2) [mm], each once; closed, or cut by an image's border."""
 
-    def __init__(self, points: FloatArray) -> None:
-        closed = np.vstack([points, points[:1]])
-        length = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+    def __init__(self, points: FloatArray, closed: bool = True) -> None:
+        through = np.vstack([points, points[:1]]) if closed else points
+        length = np.linalg.norm(np.diff(through, axis=0), axis=1)
         keep = np.append(length > 1e-3 * np.median(length), True)
-        closed, s = closed[keep], np.concatenate([[0.0], np.cumsum(length[keep[:-1]])])
-        self.points, self.length = np.asarray(closed[:-1], np.float64), float(s[-1])
-        closed[-1] = closed[0]
-        self._curve = CubicSpline(s, closed, bc_type="periodic")
+        through, s = through[keep], np.concatenate([[0.0], np.cumsum(length[keep[:-1]])])
+        if closed:
+            through[-1] = through[0]
+        self.points = np.asarray(through[:-1] if closed else through, np.float64)
+        self.length, self.closed = float(s[-1]), closed
+        self._curve = CubicSpline(s, through, bc_type="periodic" if closed else "not-a-knot")
 
     @cached_property
     def _fine(self) -> tuple[FloatArray, cKDTree]:
         step = _FINE_PX * self.length / len(self.points)
-        s = np.linspace(0.0, self.length, int(self.length / step), endpoint=False)
+        s = np.linspace(0.0, self.length, int(self.length / step), endpoint=not self.closed)
         return np.asarray(s, dtype=np.float64), cKDTree(self._curve(s))
 
     @cached_property
@@ -55,10 +57,14 @@ class Contour:
     def evenly(self, step: float) -> tuple[FloatArray, float]:
         """Points (n, 2) about so far apart along the curve, at least 16, and their distance."""
         count = max(16, round(self.length / step))
-        return self._curve(np.arange(count) * self.length / count), self.length / count
+        step = self.length / (count if self.closed else count - 1)
+        return self._curve(np.arange(count) * step), step
 
     def distance(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) signed distance of points (n, 2) from the curve [mm], and (n, 2) its gradient."""
+        """(n,) signed distance of points (n, 2) from the curve [mm], and (n, 2) its gradient.
+
+        NaN and 0 beyond the ends of a curve that is cut.
+        """
         fine, tree = self._fine
         s, step = fine[tree.query(x)[1]], self.length / len(self.points)
         for _ in range(3):
@@ -66,11 +72,16 @@ class Contour:
             square = (along**2).sum(axis=1)
             slope = square + (off * bent).sum(axis=1)
             slope = np.where(slope > 0.2 * square, slope, square)
-            s = np.mod(s - np.clip((off * along).sum(axis=1) / slope, -step, step), self.length)
-        along = self._curve(s, 1)
+            s = s - np.clip((off * along).sum(axis=1) / slope, -step, step)
+            s = np.mod(s, self.length) if self.closed else np.clip(s, 0.0, self.length)
+        along, off = self._curve(s, 1), x - self._curve(s)
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
         normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return ((x - self._curve(s)) * normal).sum(axis=1), normal
+        d = (off * normal).sum(axis=1)
+        if not self.closed:
+            beyond = np.abs((off * along).sum(axis=1)) > step
+            d[beyond], normal[beyond] = np.nan, 0.0
+        return d, normal
 
 
 @dataclass(frozen=True, eq=False)

@@ -160,7 +160,7 @@ class MeasureRun(StagedRun[MeasureCase]):
     def plain(self) -> PlainSurface | None:
         """The reference's contours where it has no speckle; None if it has, or is masked."""
         of_images = self.case.mask is self.case.mesh is None
-        return plain_surface(self.reference.image, str(self.case.reference)) if of_images else None
+        return plain_surface(self.reference.image) if of_images else None
 
     @cached_property
     def grid(self) -> PixelGrid:

@@ -291,7 +291,7 @@ class HarvestRun(StagedRun[PhotographCase]):
                 f"local: expected code = 'none', got {self.case.local.code!r}: a specimen without "
                 "speckle is measured by its contours; leave [local] out"
             )
-        return plain_surface(self.prepared.image(), self.case.images.reference)
+        return plain_surface(self.prepared.image())
 
     def _by_contours(
         self, name: str, plain: PlainSurface
