@@ -173,7 +173,7 @@ def rows(pixel_size: float, only: list[str]) -> Iterator[str]:
             pair = pairs[row.strain]
             assert pair.truth
             u, px = pair.truth.displacement[row.window(pair.grid.shape)], pair.grid.pixel_size
-            grid = PixelGrid.centred(*u.shape[:2], px)
+            grid = PixelGrid.centred(u.shape[0], u.shape[1], px)
             found = measured(Path(name), grid, row, 0)
             u = truth(u, grid, np.deg2rad(row.turn_deg))
             off, sd, there = compared(found, u)
@@ -243,7 +243,7 @@ def draw(pixel_size: float, file: Path) -> None:
         pair = imaged(pixel_size, Path(name))[row.strain]
         assert pair.truth
         u = pair.truth.displacement[row.window(pair.grid.shape)]
-        grid = PixelGrid.centred(*u.shape[:2], pixel_size)
+        grid = PixelGrid.centred(u.shape[0], u.shape[1], pixel_size)
         f, g = photographs(Path(name), row, 0)
         found = measured(Path(name), grid, row, 0)
     error = np.linalg.norm(found.displacement_on() - u, axis=-1) / pixel_size
