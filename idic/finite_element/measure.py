@@ -62,7 +62,7 @@ _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
 _SHORT_PX = 0.1
 """After shorter steps the matrices are kept, where only the images make them change and steps get
-shorter; rms over the nodes [px]. Blur makes steps as long as half its width short, too."""
+shorter; rms over the nodes [px]."""
 _LEAST_DET = 0.1
 """Elements that shrink to less are an iteration gone astray."""
 _UNLIKE, _SEEN = 0.25, 0.25
@@ -292,7 +292,6 @@ class _Measurement:
         """Take steps until they are short."""
         self._prepare(stage.level)
         px, last = self.pair.grid.pixel_size, np.inf
-        short = max(_SHORT_PX, 0.5 * stage.level.factor * stage.level.blur)
         for _ in range(self.options.steps):
             at = self.linearised()
             step = at.step(stage.cutoff_px * px)
@@ -300,7 +299,7 @@ class _Measurement:
             share = np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
             rms = float(np.sqrt(np.mean(length**2)))
-            if isinstance(self.prior, Imbalance) or rms > min(short, 0.5 * last):
+            if isinstance(self.prior, Imbalance) or rms > min(_SHORT_PX, 0.5 * last):
                 self.kept = None
             if (last := rms) < stage.tolerance_px:
                 break
