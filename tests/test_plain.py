@@ -177,6 +177,39 @@ def test_a_bar_that_is_pressed_between_frictionless_plates_shortens_evenly() -> 
     assert within.mean() > 0.95
 
 
+def test_edges_beside_the_border_of_the_picture_are_contours_all_the_same() -> None:
+    half, images = np.array([80.3, 50.4]), []
+    for size in (half, half * [0.98, 1.016]):  # about what free sides do
+        whole = plate(size, np.zeros(2))
+        images.append((whole, whole[16:-16, 16:-16]))  # 3.6 px are left beside it
+    found = []
+    for f, g in zip(*images, strict=True):
+        grid, seen = PixelGrid.centred(*f.shape, 0.1), [plain_surface(f), plain_surface(g)]
+        assert seen[0]
+        assert seen[1]
+        body = FiniteElementOptions().body(seen[0].mask, grid)
+        contours = matched_contours(seen[0], seen[1], grid)
+        start = contours.start(body.mesh.nodes)
+        result = displacement_from_contours(contours.seen, body, grid, start)
+        assert result.outside == 0
+        found.append(result.at(np.array([[7.8, 0.0], [-7.8, 0.0], [3.0, 4.8]])))
+    np.testing.assert_allclose(found[0], found[1], atol=0.01)
+
+
+def test_a_start_inside_out_ends_in_one_line(photographed: Path) -> None:
+    f, g = (
+        read_image(photographed / f"{name}_8bit.tif")[60:-60, 60:-60]
+        for name in ("reference", "deformed_1280")
+    )
+    grid, surface, other = PixelGrid.centred(*f.shape, 0.04), plain_surface(f), plain_surface(g)
+    assert surface
+    assert other
+    body = FiniteElementOptions().body(surface.mask, grid)
+    seen, start = matched_contours(surface, other, grid).seen, body.mesh.nodes * [-2.0, 0.0]
+    with pytest.raises(InputError, match="contours that hold the body"):
+        displacement_from_contours(seen, body, grid, start)
+
+
 @pytest.fixture(scope="module")
 def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("plain")

@@ -53,12 +53,11 @@ _PLATE = 1e6
 _FAR_PX = 3.0
 """The mesh's edge is off the contour of the reference by less, or that contour is not known."""
 _CUT_PX = 5.0
-"""Sides of elements whose middle is nearer to the image's border are cut by it: the boundary of a
-mask is rounded off there."""
+"""Sides of elements nearer to the image's border are cut by it: masks are rounded off there."""
 _MOST_SIDES = 4
 """Of elements in one piece of a cut, whose tractions have two resultants and a moment."""
-_SHOWN = 3.0
-"""Share of the variance of the contours' noise that springs, which give way, show [-]."""
+_RIDGE = 3.0
+"""Weight of tractions, over stress, in variances of the contours' noise [-]; found by trial."""
 _ROUNDS, _LONGEST_PX = 3, 8.0
 """Of the tractions at cut sides, and what they move a node by in one step, at most."""
 _CORNER = np.deg2rad(35.0)
@@ -102,7 +101,8 @@ class _Edge:
         self.off: FloatArray = np.zeros(len(self.points))
         off, _ = self._distances(self.points, seen.reference)
         self.off = np.nan_to_num(off)
-        self.cut = _cut_ligaments(mesh, sides, grid).repeat(t.size)
+        is_part = not all(contour.closed for contour in seen.reference)
+        self.cut = np.where(is_part, _cut_ligaments(mesh, sides, grid), -1).repeat(t.size)
         """(q,) number of the ligament that the image's border cuts, from 0; -1 elsewhere."""
         self.whole_length = self.length.copy()
         self.length[~(np.abs(off) < _FAR_PX * pixel_size) | (self.cut >= 0)] = 0.0
@@ -239,10 +239,14 @@ class _PenalisedBody:
         self.law = Imbalance(self.mesh, law, self._none)
         self.shear = float(stress_and_tangent(law, np.eye(2)[None])[1][0, 0, 1, 0, 1])
 
+    def _deformation_gradient(self, u: FloatArray) -> FloatArray:
+        """(m, q, 2, 2) F at the points of each element [-]."""
+        cells = u.reshape(-1, 2)[self.mesh.cells]
+        return np.asarray(np.eye(2) + np.einsum("eai,eqaj->eqij", cells, self.law.slopes))
+
     def energy(self, u: FloatArray) -> float:
         """Of the body and its springs [N/mm times mm]; infinite where it is turned inside out."""
-        cells = u.reshape(-1, 2)[self.mesh.cells]
-        F = np.eye(2) + np.einsum("eai,eqaj->eqij", cells, self.law.slopes)
+        F = self._deformation_gradient(u)
         if np.linalg.det(F).min() < _LEAST_DET:
             return np.inf
         W = self.law.material.energy(JetMatrix(F.reshape(-1, 2, 2))).value
@@ -307,7 +311,7 @@ class _PenalisedBody:
             more = answer @ d - kept @ self.tractions
             step = by_tractions @ more
             share = min(1.0, _LONGEST_PX * self.px / max(float(np.abs(step).max()), 1e-300))
-            while not np.isfinite(self.energy(self.u + share * step)):
+            while share > 1e-6 and not np.isfinite(self.energy(self.u + share * step)):
                 share *= 0.5
             self.tractions, self.u = self.tractions + share * more, self.u + share * step
             converged = self.relax(springs, tolerance_px)
@@ -321,15 +325,14 @@ class _PenalisedBody:
         """
         by_tractions = factor.solve(self.loads)
         D = self.edge.normal_shapes(normal) @ by_tractions
-        weighed, ridge = D.T * self.edge.length, _SHOWN * self.noise / self.stress() ** 2
+        weighed, ridge = D.T * self.edge.length, _RIDGE * self.noise / self.stress() ** 2
         square = weighed @ D + ridge * np.eye(D.shape[1])
         kept = ridge * np.linalg.inv(square)
         return by_tractions, -np.linalg.solve(square, weighed), kept
 
     def stress(self) -> float:
         """Rms of a component of the first Piola-Kirchhoff stress over the body, over mu [-]."""
-        cells = self.u.reshape(-1, 2)[self.mesh.cells]
-        F = np.eye(2) + np.einsum("eai,eqaj->eqij", cells, self.law.slopes)
+        F = self._deformation_gradient(self.u)
         P = stress_and_tangent(self.law.material, F.reshape(-1, 2, 2))[0] / self.shear
         weights = np.broadcast_to(self.law.weights, F.shape[:2]).ravel()
         return float(np.sqrt(np.average((P**2).mean(axis=(1, 2)), weights=weights)))
@@ -403,12 +406,12 @@ class _PenalisedBody:
     def by_other_tractions(self, factor: Factor, count: int) -> FloatArray:
         """(n, 2, count) what random tractions at cuts do, uneven or not shown by contours."""
         _, normal = self.edge.distances(self.u.reshape(-1, 2))
-        by_tractions, _, kept = self.answers(factor, normal)
-        z = self.stress() * np.random.default_rng(1).standard_normal(
-            (2, self.tractions.size, count)
-        )
-        uneven = self.with_tractions(factor.solve(self.uneven @ z[0]), factor)
-        return np.asarray(uneven + by_tractions @ (kept @ z[1])).reshape(-1, 2, count)
+        by_tractions, answer, kept = self.answers(factor, normal)
+        shape = 2, self.tractions.size, count
+        z = self.stress() * np.random.default_rng(1).standard_normal(shape)
+        u = factor.solve(self.uneven @ z[0])
+        resultants = answer @ (self.edge.normal_shapes(normal) @ u) + kept @ z[1]
+        return np.asarray(u + by_tractions @ resultants).reshape(-1, 2, count)
 
 
 def displacement_from_contours(
@@ -423,7 +426,7 @@ def displacement_from_contours(
 ) -> NodalResult:
     """Find the displacement of a body from the contours of its edges.
 
-    InputError if no contour is at the mesh's edge.
+    InputError if no contour is at the mesh's edge, or they don't hold the body.
 
     seen : contours in the reference and in the deformed image [mm].
     body : T6 mesh of the material in the reference.
@@ -437,20 +440,23 @@ def displacement_from_contours(
     state = _PenalisedBody(body, seen, grid, law or ELASTOMER, start)
     soft, stiff = _SPRINGS
     step = partial(progress, total=3, what="displacement from contours")
-    step(0)
-    state.settle(soft, _ROUGH_PX)
-    sides = state.pressed_sides()
-    state.press(sides, slides=slides)
-    step(1)
-    state.settle(soft, 10.0 * _TOLERANCE_PX)
-    before = state.u
-    step(2)
-    state.take_up(stiff / soft)
-    converged = state.settle(stiff, _TOLERANCE_PX)
-    step(3)
-    u, mesh = state.u.reshape(-1, 2), body.mesh
-    left = np.asarray(state.u - before).reshape(-1, 2) * (soft / (stiff - soft))
-    sd, known = _deviations(state, seen.noise, law is None, bool(sides) and not slides, left)
+    try:
+        step(0)
+        state.settle(soft, _ROUGH_PX)
+        sides = state.pressed_sides()
+        state.press(sides, slides=slides)
+        step(1)
+        state.settle(soft, 10.0 * _TOLERANCE_PX)
+        before = state.u
+        step(2)
+        state.take_up(stiff / soft)
+        converged = state.settle(stiff, _TOLERANCE_PX)
+        step(3)
+        u, mesh = state.u.reshape(-1, 2), body.mesh
+        left = np.asarray(state.u - before).reshape(-1, 2) * (soft / (stiff - soft))
+        sd, known = _deviations(state, seen.noise, law is None, bool(sides) and not slides, left)
+    except ArithmeticError as error:
+        raise InputError(f"expected contours that hold the body, got others: {_ASTRAY}") from error
     d, _ = state.edge.distances(u)
     return NodalResult(
         mesh=mesh,

@@ -244,7 +244,7 @@ def _unbent(contour: Contour, variance: float) -> FloatArray:
     found, window = seen, min(2 * round(_CURVED_PX / step) + 1, (len(seen) - 1) | 1)
     how = "wrap" if contour.closed else "interp"
     for _ in range(_SHARPENED):
-        bent = savgol_filter(found, min(window, len(seen)), 5, 2, step, axis=0, mode=how)
+        bent = savgol_filter(found, window, 5, 2, step, axis=0, mode=how)
         length = np.linalg.norm(bent, axis=1, keepdims=True)
         found = seen - 0.5 * variance * bent * np.minimum(1.0, _SHARPEST / np.maximum(length, 1e-9))
     return np.asarray(found)
@@ -268,11 +268,6 @@ class MatchedContours:
     """In the reference and in the deformed picture."""
     lost: int
     """Holes of the reference that weren't found in the deformed picture."""
-
-    @property
-    def centres(self) -> list[FloatArray]:
-        """Of the holes in the reference [mm]."""
-        return [hole.moments[1] for hole, _ in self.holes]
 
     def start(self, points: FloatArray) -> FloatArray:
         """(n, 2) displacement of points (n, 2) [mm] by the affine motion."""
@@ -404,7 +399,8 @@ def displacement_of_plain(
     start = matched.start(body.mesh.nodes)
     found = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
     if reference.cut:
-        found = _away_from_cuts(found, reference.mask, _spacing(np.array(matched.centres)))
+        centres = np.array([hole.moments[1] for hole, _ in matched.holes])
+        found = _away_from_cuts(found, reference.mask, _spacing(centres))
     if matched.lost:
         lost = f"{matched.lost} holes weren't found again: what is around them follows from a law."
         found = replace(found, warnings=(*found.warnings, lost))
