@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from modeharvest.cli.root import app
+from modeharvest.idic.photograph.gauges import Gauge
 from modeharvest.idic.photograph.geometry import RegionTable
 from modeharvest.runs.case import case_text, checked
 from modeharvest.runs.photographs.case import PhotographCase
@@ -34,7 +35,7 @@ def options() -> dict[str, dict[str, tuple[str, str]]]:
 
 def tables() -> dict[str, type[Any]]:
     kinds = {n: f.annotation for n, f in PhotographCase.model_fields.items() if n != "title"}
-    return {**kinds, "specimen.regions": RegionTable}
+    return {**kinds, "specimen.regions": RegionTable, "gauges": Gauge}
 
 
 def test_the_command_prints_it() -> None:

@@ -62,6 +62,16 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+GAUGES = """
+[[gauges]]
+name = "middle"
+point = [0.0, 0.0]
+[[gauges]]
+name = "along"
+line = [[-1.9, 0.0], [1.9, 0.0]]
+"""
+
+
 def experiment(folder: Path, more: str = "", formulation: str = "total") -> Path:
     path = folder / "experiment.toml"
     path.write_text(
@@ -80,7 +90,7 @@ def rms_px(field: FloatArray, inside: NDArray[np.bool_]) -> float:
 @pytest.fixture(scope="module")
 def harvested(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
-    harvest(experiment(photographs), out, whole_field=True)
+    harvest(experiment(photographs, GAUGES), out, whole_field=True)
     return out
 
 
@@ -108,6 +118,23 @@ def test_what_the_ansatz_cannot_describe_is_measured(
         assert rms_px(error, there) < 0.12
         assert rms_px(error, there) < 0.4 * rms_px(by_idic, there)
         assert (folder / "whole_field" / f"{name}.vtu").is_file()
+
+
+def test_gauges_read_the_truth_and_are_in_the_report(harvested: Path) -> None:
+    rows = summary(harvested)["gauges"]
+    read = {(row["image"], row["gauge"], row["reads"]): row for row in rows}
+    for name, strain in STATES.items():
+        left, middle, right = truth(strain)(np.array([[-1.9, 0.0], [0.0, 0.0], [1.9, 0.0]]))
+        for what, value in zip("uv", middle, strict=True):
+            row = read[name, "middle", what]
+            assert row["unit"] == "mm"
+            assert row["value"] == pytest.approx(value, abs=4.0 * row["sd"] + 0.02 * PIXEL)
+        length = np.linalg.norm(np.array([3.8, 0.0]) + right - left)
+        assert read[name, "along", "length"]["value"] == pytest.approx(length, abs=0.3 * PIXEL)
+    page = (harvested / "report.html").read_text()
+    assert "What gauges read in frame_2" in page
+    assert "<h2>Gauges</h2>" in page or ">Gauges<" in page
+    assert (harvested / "gauges.csv").read_text().count("\n") == 3
 
 
 def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) -> None:
@@ -286,6 +313,8 @@ def test_it_is_left_out_unless_asked_for(photographs: Path, tmp_path: Path) -> N
         ("element_px = 2.0", "element_px"),
         ("material_law = true", "unknown key whole_field.material_law"),
         ("mesure = true", "did you mean 'measure'"),
+        ("[[gauges]]\nname = 'a'\npoint = [0, 0]", "gauges: expected whole displacements"),
+        ("[[gauges]]\nname = 'a'\npoint = [0, 0]\n" * 2, "different names, got 'a' again"),
     ],
 )
 def test_bad_input(

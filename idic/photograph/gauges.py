@@ -7,7 +7,7 @@ reading, squared and summed: what neighbours have in common counts as it does in
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -85,13 +85,18 @@ def read_gauges(path: Path | str) -> tuple[Gauge, ...]:
     if not tables:
         raise InputError(f"{path}: expected [[gauges]], got none")
     try:
-        gauges = tuple(made(Gauge, table) for table in tables)
+        return distinct(made(Gauge, table) for table in tables)
     except InputError as error:
         raise InputError(f"{path}: gauges: {error}") from error
-    names = sorted(gauge.name for gauge in gauges)
+
+
+def distinct(gauges: Iterable[Gauge]) -> tuple[Gauge, ...]:
+    """The gauges; InputError if two have the same name."""
+    found = tuple(gauges)
+    names = sorted(gauge.name for gauge in found)
     if twice := next((a for a, b in pairwise(names) if a == b), None):
-        raise InputError(f"{path}: expected gauges of different names, got {twice!r} again")
-    return gauges
+        raise InputError(f"expected gauges of different names, got {twice!r} again")
+    return found
 
 
 def read_at(gauge: Gauge, result: NodalResult, unit: str = "mm") -> Readings:
@@ -184,6 +189,15 @@ def _nodal(result: NodalResult) -> FloatArray:
     u = u if result.roots is None else np.concatenate([u, result.roots], axis=2)
     slopes = nodal_gradient(result.mesh, u.reshape(len(u), -1)).reshape(*u.shape, 2)
     return np.moveaxis(np.concatenate([u[..., None], slopes], axis=-1), 2, -1)
+
+
+def reading_rows(readings: Mapping[str, Mapping[str, Readings]]) -> list[dict[str, Any]]:
+    """What :func:`write_gauges` returns as rows ``image gauge reads value sd unit``."""
+    return [
+        {"image": image, "gauge": gauge, "reads": what, **reading._asdict()}
+        for image, own in readings.items()
+        for gauge, found in own.items() for what, reading in found.items()
+    ]  # fmt: skip
 
 
 def write_gauges(

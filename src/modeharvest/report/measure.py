@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.photograph.gauges import Gauge, GaugeReading
+from modeharvest.idic.photograph.gauges import Gauge
 from modeharvest.report.explore import explored_images
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field, draw_image
-from modeharvest.report.figures.on_photographs import draw_gauge, draw_gauges_on
+from modeharvest.report.figures.on_photographs import draw_gauges_on, gauge_cards
 from modeharvest.report.figures.sequence import force_cards
 from modeharvest.report.model import (
     Card,
@@ -62,6 +62,10 @@ def measure_report(
                 _cards(k, names[k], results, residual, picture, summary["unit"]))
         for k in shown
     ] if results and residual and picture else []  # fmt: skip
+    strains, placed = {image["name"]: image["strain_x"] for image in images}, None
+    if gauges and results and picture:
+        shown_on = results[names[-1]], gauges, picture(names[-1]), summary["unit"]
+        placed = partial(draw_gauges_on, *shown_on)
     return Report(
         kind="measurement",
         title=summary["title"],
@@ -75,7 +79,7 @@ def measure_report(
         sections=[
             *maps,
             Section.of("timeline", force_cards(images, "strain_x", "mean strain along x")),
-            Section.of("gauges", _gauge_cards(summary, gauges, results, picture)),
+            Section.of("gauges", gauge_cards(summary.get("gauges", ()), strains, placed)),
             Section.of("numbers", Card.tabular(table, wide=True)),
         ],
         warnings=[
@@ -91,42 +95,8 @@ def measure_report(
         command=summary["command"],
         explore=partial(explored_images, results, summary["unit"], residual) if results else None,
         versions=summary["versions"],
-        **caption("page-measure"),
+        **caption("page-measure-contours" if by_contours else "page-measure"),
     )  # fmt: skip
-
-
-def _gauge_cards(
-    summary: Summary,
-    gauges: Sequence[Gauge],
-    results: Mapping[str, NodalResult] | None,
-    picture: Picture | None,
-) -> list[Card]:
-    """Gauges on the last photograph, their strains over the test, and all that they read in it."""
-    read, images = summary.get("gauges", ()), summary["images"]
-    if not read:
-        return []
-    last, cards = images[-1]["name"], []
-    strain = np.array([image["strain_x"] for image in images])
-    if gauges and results and picture:
-
-        def placed() -> Figure:
-            return draw_gauges_on(results[last], gauges, picture(last), summary["unit"])
-
-        cards = [Card.captioned("gauges-placed", placed, image=last)]
-    for k, gauge in enumerate(dict.fromkeys(row["gauge"] for row in read)):
-        own = [
-            {row["reads"]: GaugeReading(row["value"], row["sd"], row["unit"])
-             for row in read if row["gauge"] == gauge and row["image"] == image["name"]}
-            for image in images
-        ]  # fmt: skip
-        figure = ReportFigure(f"gauge-{k + 1}", "", partial(draw_gauge, gauge, own, strain))
-        cards.append(Card(**caption("gauge", gauge=gauge), figures=[figure]))
-    rows = [
-        {**row, "reads": row["reads"].replace("_", " "), "value": number(row["value"], 5),
-         "sd": number(row["sd"], 2)}
-        for row in read if row["image"] == last
-    ]  # fmt: skip
-    return [*cards, *Card.tabular(ReportTable.of("gauges", rows, image=last), wide=True)]
 
 
 def _cards(

@@ -15,6 +15,7 @@ from modeharvest.report.explore import explored_photographs
 from modeharvest.report.figures import fits
 from modeharvest.report.figures import photographs as figures
 from modeharvest.report.figures.curves import draw_onset, draw_waves
+from modeharvest.report.figures.on_photographs import draw_gauges_on, gauge_cards
 from modeharvest.report.figures.photographs import PhotographState
 from modeharvest.report.figures.sequence import force_cards
 from modeharvest.report.figures.whole_field import whole_cards, whole_panel_numbers
@@ -79,6 +80,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
             *drawn,
             Section.of("truth", expected_cards("truth", summary.get("truth") or []), "expected"),
             *([_timeline(harvest, summary)] if harvest else []),
+            Section.of("gauges", _gauge_cards(summary, states)),
             Section.of("numbers", number_cards(summary, shown, names)),
             Section.of("convergence", steps),
         ],
@@ -323,6 +325,17 @@ def _timeline(harvest: Harvest, summary: Summary) -> Section:
     if len(frames) > 1:
         cards.append(Card.captioned("timeline-waves", partial(draw_waves, frames)))
     return Section.of("timeline", cards)
+
+
+def _gauge_cards(summary: Summary, states: Sequence[PhotographState]) -> list[Card]:
+    """What gauges read, and where they are on the last photograph that has a whole displacement."""
+    rows, placed = summary.get("gauges", ()), None
+    read = {row["image"] for row in rows}
+    strains = {f["name"]: f["strain_x"] for f in summary["frames"] if f["name"] in read}
+    if rows and states and (whole := states[-1].frame.whole):
+        image, gauges = states[-1].frame.image, states[-1].harvest.case.gauges
+        placed = partial(draw_gauges_on, whole.measured, gauges, image / image.max(), "mm")
+    return gauge_cards(rows, strains, placed)
 
 
 def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:

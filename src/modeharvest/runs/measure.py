@@ -47,7 +47,7 @@ from modeharvest.idic.photograph.displacement import (
     residual,
     speckled,
 )
-from modeharvest.idic.photograph.gauges import read_gauges, write_gauges
+from modeharvest.idic.photograph.gauges import read_gauges, reading_rows, write_gauges
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain import (
     PlainSurface,
@@ -330,12 +330,9 @@ class MeasureRun(StagedRun[MeasureCase]):
             from modeharvest.report.measure import measure_report
             from modeharvest.report.model import write_page
 
-            read = gauges and write_gauges(self.folder, gauges, self._with_roots(), self.case.unit)
-            summary["gauges"] = [
-                {"image": image, "gauge": gauge, "reads": what, **reading._asdict()}
-                for image, own in (read or {}).items()
-                for gauge, found in own.items() for what, reading in found.items()
-            ]  # fmt: skip
+            if gauges:
+                read = write_gauges(self.folder, gauges, self._with_roots(), self.case.unit)
+            summary["gauges"] = reading_rows(read) if gauges else []
             report = measure_report(summary, results, self.residual, self.picture, gauges)
             write_page(report, self.folder / "report.html", self.progress)
             write_json(self.folder / "summary.json", summary)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ from PIL import Image
 
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.photograph.finished import FinishedRun
-from modeharvest.idic.photograph.gauges import Gauge, Readings
+from modeharvest.idic.photograph.gauges import Gauge, GaugeReading, Readings
 from modeharvest.report.figures import maps, style
 from modeharvest.report.figures.boundaries import MeshBoundary
+from modeharvest.report.model import Card, ReportFigure, ReportTable, caption, number
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import MissingDependencyError
 from modeharvest.util.files import atomic
@@ -146,6 +147,35 @@ def draw_gauges_on(
                       color=style.colour(k), bbox={"fc": "white", "lw": 0, "pad": 1.5})  # fmt: skip
     axes.set(xlim=frame.limits[:2], ylim=frame.limits[2:])
     return drawn
+
+
+def gauge_cards(
+    rows: Sequence[Mapping[str, Any]], strains: Mapping[str, float], placed: Draw | None
+) -> list[Card]:
+    """Gauges on the last photograph, their strains over the test, and all that they read in it.
+
+    ``rows``: of ``summary.json``; ``strains``: along x [-] by the images' names, in their order;
+    ``placed``: draws the gauges.
+    """
+    if not rows:
+        return []
+    last = [*strains][-1]
+    cards = [] if placed is None else [Card.captioned("gauges-placed", placed, image=last)]
+    for k, gauge in enumerate(dict.fromkeys(row["gauge"] for row in rows)):
+        own = [
+            {row["reads"]: GaugeReading(row["value"], row["sd"], row["unit"])
+             for row in rows if row["gauge"] == gauge and row["image"] == image}
+            for image in strains
+        ]  # fmt: skip
+        drawn = partial(draw_gauge, gauge, own, np.array([*strains.values()]))
+        figure = ReportFigure(f"gauge-{k + 1}", "", drawn)
+        cards.append(Card(**caption("gauge", gauge=gauge), figures=[figure]))
+    table = [
+        {**row, "reads": row["reads"].replace("_", " "), "value": number(row["value"], 5),
+         "sd": number(row["sd"], 2)}
+        for row in rows if row["image"] == last
+    ]  # fmt: skip
+    return [*cards, *Card.tabular(ReportTable.of("gauges", table, image=last), wide=True)]
 
 
 def print_fields(

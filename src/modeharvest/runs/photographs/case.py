@@ -10,11 +10,12 @@ import glob
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from pydantic import PrivateAttr
+from pydantic import AfterValidator, PrivateAttr
 
 from modeharvest.idic.local.subsets import SubsetOptions
+from modeharvest.idic.photograph.gauges import Gauge, distinct
 from modeharvest.idic.photograph.geometry import Corners, SpecimenTable
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.runs.case import CaseModel
@@ -172,6 +173,7 @@ class PhotographCase(CaseModel):
     correlation: PhotographOptions = PhotographOptions()
     whole_field: WholeFieldOptions = WholeFieldOptions()
     contours: ContourTable = ContourTable()
+    gauges: Annotated[tuple[Gauge, ...], AfterValidator(distinct)] = ()
 
     _base: Path = PrivateAttr(Path())
     _written: Images | None = PrivateAttr(None)

@@ -10,6 +10,7 @@
     whole_field/NAME.h5  NAME.vtu                   whole displacements, where they are asked for
     whole_field/NAME_refit.json                     the ansatz of the result, refitted to it
     contours/NAME.json                  contours    the same by contours beside speckle, if wanted
+    gauges.csv  gauges_along.csv                    what gauges read, if any are named
     report.html  summary.json           report      everything that was found
     stages.json timings.json                        which stages are finished, what they took
 """
@@ -25,12 +26,13 @@ from typing import Any
 import numpy as np
 
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.finite_element.files import Given
+from modeharvest.idic.finite_element.files import Given, read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field, write_field
+from modeharvest.idic.photograph.gauges import reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
     MeasuredPhotograph,
@@ -203,7 +205,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             from modeharvest.report.model import write_page
             from modeharvest.report.photographs import photographs_report
 
-            harvest = self.harvest(truth)
+            harvest = replace(self.harvest(truth), gauges=self._gauges())
             summary = harvest_summary(harvest)
             report = photographs_report(summary, harvest)
             write_page(report, self.folder / "report.html", self.progress)
@@ -216,6 +218,11 @@ class HarvestRun(StagedRun[PhotographCase]):
     def _correlated(self) -> tuple[Mapping[str, MeasuredPhotograph], dict[str, str]]:
         """Photographs that were measured, and why others could not be."""
         _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
+        if self.case.gauges and self._plain is None and not self.case.whole_field.measure:
+            raise InputError(
+                "gauges: expected whole displacements, which they read, got none: give "
+                "--whole-field, or set measure = true in [whole_field]"
+            )
 
         def work(
             name: str, last: tuple[str, MeasuredPhotograph] | None
@@ -304,6 +311,14 @@ class HarvestRun(StagedRun[PhotographCase]):
         )  # fmt: skip
         write_holes(holes, contours)
         return found, (holes, *self._whole_files(name, found))
+
+    def _gauges(self) -> list[dict[str, Any]]:
+        """What gauges read in every whole displacement; leaves ``gauges.csv``."""
+        if not (wanted := self.case.gauges):
+            return []
+        found = {name: self._wholes.path(name) for name, m in self.results().items() if m.whole}
+        each = ((name, read_result(path, with_roots=True)) for name, path in found.items())
+        return reading_rows(write_gauges(self.folder, wanted, each, "mm")) if found else []
 
     def _whole_files(self, name: str, found: MeasuredPhotograph) -> tuple[Path, ...]:
         """Write a whole displacement and the ansatz refitted to it."""

@@ -148,6 +148,8 @@ class Harvest:
     optics: Optics = field(default_factory=Optics)
     full_scale: float | None = None
     """Largest grey level of the camera; None if not known."""
+    gauges: Sequence[Mapping[str, Any]] = ()
+    """``gauges`` of the summary: what each reads in every photograph."""
     warnings: tuple[str, ...] = ()
     """What makes errors larger, and what else the photographs show."""
     text: tuple[str, ...] = ()
@@ -312,7 +314,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
         "lattice": _lattice(harvest.geometry.lattice) if harvest.geometry.lattice else None,
         "optics": harvest.optics.distortion and _optics(harvest, harvest.optics.distortion),
         "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
-        **picked(harvest, "text warnings"),
+        **picked(harvest, "gauges text warnings"),
         "truth": [] if harvest.truth is None else harvest.truth.rows,
         "versions": harvest.versions,
     }
