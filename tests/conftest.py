@@ -37,6 +37,8 @@ settings.register_profile(
 settings.load_profile("modeharvest")
 
 FILES_THAT_TAKE_LONG = (
+    "test_site.py",
+    "test_identification_run.py",
     "test_disturbed.py",
     "test_pipeline.py",
     "test_homogenization_run.py",
