@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +25,8 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
+from skimage.draw import polygon2mask
 from whole_coverage import refitted_against
 
 from modeharvest.fem.field import Solution
@@ -55,6 +56,7 @@ HEADS = (
     "off the contours, rms [px]", "v1 phi1 off the best fit [%]", "waves off it [%]",
 )  # fmt: skip
 MARGIN_PX = 40
+FINE = 8
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class Row:
     rows: tuple[float, float] = (0.0, 1.0)
     cols: tuple[float, float] = (0.0, 1.0)
     """The part of the pictures that is taken."""
+    dots: float = 0.0
+    """Diameter of those painted between any four holes [mm]; 0 for none."""
 
     @property
     def is_part(self) -> bool:
@@ -110,6 +114,7 @@ ROWS = (
     Row("two-term I1 law", law=TwoTermI1()),
     Row("cut across", cols=(0.0, 0.6)), Row("cut along", rows=(0.0, 0.5)),
     Row("middle", rows=(0.2, 0.8), cols=(0.2, 0.8)),
+    Row("dots", dots=0.36), Row("dots before buckling", strain=0.078, dots=0.36),
 )  # fmt: skip
 
 
@@ -121,10 +126,52 @@ def turned(image: FloatImage, turn: float) -> FloatImage:
     return np.asarray(map_coordinates(image, at.T, order=3, mode="nearest").reshape(image.shape))
 
 
-def photographs(folder: Path, row: Row, seed: int) -> tuple[FloatImage, FloatImage]:
-    """The two pictures of a row, 8 bit."""
+def painted(
+    image: FloatImage, edges: Sequence[FloatArray], grey: float = 0.15, psf_px: float = 0.6
+) -> FloatImage:
+    """An image with areas painted over, inside of polygons (n, 2) of (row, col), as pixels average.
+
+    The polygons are as the deformed material has them: dots are rendered on their own.
+    """
+    share = np.zeros(image.shape)
+    for points in edges:
+        low = np.floor(points.min(axis=0)).astype(int) - 1
+        rows, cols = np.ceil(points.max(axis=0)).astype(int) + 2 - low
+        fine = polygon2mask((FINE * rows, FINE * cols), (points - low + 0.5) * FINE - 0.5)
+        mean = fine.reshape(rows, FINE, cols, FINE).mean(axis=(1, 3))
+        there = np.s_[low[0] : low[0] + rows, low[1] : low[1] + cols]
+        share[there] = np.maximum(share[there], mean)
+    share = gaussian_filter(share, psf_px)
+    return np.asarray(image + share * (grey - image), dtype=np.float32)
+
+
+def dots(pair: ImagePair, diameter: float) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Edges of dots between any four holes in both of a specimen's images, (n, 2) of (row, col)."""
+    specimen = Solution.read(SHIPPED).specimen
+    assert specimen
+    assert pair.truth
+    u = np.nan_to_num(np.asarray(pair.truth.displacement))
+    places = specimen.hole_centres + 0.5 * specimen.pitch
+    inside = (places < specimen.hole_centres.max(axis=0)).all(axis=1)
+    turn = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
+    found: tuple[list[FloatArray], list[FloatArray]] = [], []
+    for place in places[inside]:
+        X = place + 0.5 * diameter * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        at = np.stack(pair.grid.to_px(*X.T))
+        moved = X + np.stack([map_coordinates(u[..., k], at, order=1) for k in (0, 1)], axis=1)
+        found[0].append(at.T)
+        found[1].append(np.stack(pair.grid.to_px(*moved.T), axis=1))
+    return found
+
+
+def photographs(
+    folder: Path, row: Row, seed: int, pair: ImagePair | None = None
+) -> tuple[FloatImage, FloatImage]:
+    """The two pictures of a row, 8 bit; of a ``pair`` if there are dots."""
     rng, tag = np.random.default_rng(seed), f"deformed_{round(1e4 * row.strain):04d}"
     f, g = (read_image(folder / f"{name}.tif") for name in ("reference", tag))
+    if row.dots and pair:
+        f, g = (painted(*one) for one in zip((f, g), dots(pair, row.dots), strict=True))
     pictures = row.reference(f), row.deformed(turned(g, np.deg2rad(row.turn_deg)))
     noisy = (p + row.noise * rng.standard_normal(p.shape, dtype=np.float32) for p in pictures)
     first, second = (quantise(p, 8).astype(np.float32)[row.window(p.shape)] for p in noisy)
@@ -139,9 +186,11 @@ def truth(u: FloatArray, grid: PixelGrid, turn: float) -> FloatArray:
     return np.asarray((X + u - middle) @ R.T + middle - X)
 
 
-def measured(folder: Path, grid: PixelGrid, row: Row, seed: int) -> NodalResult:
+def measured(
+    folder: Path, grid: PixelGrid, row: Row, seed: int, pair: ImagePair | None = None
+) -> NodalResult:
     """The displacement in a row's pictures."""
-    f, g = photographs(folder, row, seed)
+    f, g = photographs(folder, row, seed, pair)
     seen = [plain_surface(image) for image in (f, g)]
     assert seen[0]
     assert seen[1]
@@ -174,7 +223,7 @@ def rows(pixel_size: float, only: list[str]) -> Iterator[str]:
             assert pair.truth
             u, px = pair.truth.displacement[row.window(pair.grid.shape)], pair.grid.pixel_size
             grid = PixelGrid.centred(u.shape[0], u.shape[1], px)
-            found = measured(Path(name), grid, row, 0)
+            found = measured(Path(name), grid, row, 0, pair)
             u = truth(u, grid, np.deg2rad(row.turn_deg))
             off, sd, there = compared(found, u)
             ratio = waves = float("nan")

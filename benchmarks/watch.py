@@ -1,6 +1,7 @@
 """A test that is watched: seconds a photograph, and the strain of buckling before it comes.
 
 scripts/env python benchmarks/watch.py            # predictions, 16 seeds
+scripts/env python benchmarks/watch.py --step 0.01 --last 0.7    # a photograph every hundredth
 scripts/env python benchmarks/watch.py --time     # seconds a photograph of 3 Mpx
 scripts/env python benchmarks/watch.py --memory harvest 20 200    # peak of so many photographs
 scripts/env python benchmarks/watch.py --memory measure 5 25
@@ -42,8 +43,8 @@ from modeharvest.runs.photographs.watch import QuickMeasurement, WatchedTest
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.growth import follow_growth
 
-SHARES = np.linspace(0.05, 0.95, 19)
-"""Of the critical strain, at which photographs are taken."""
+LAST = 0.95
+"""Of the critical strain, up to which photographs are taken."""
 PIXEL_SIZE = 0.0107
 """Of 3.14 Mpx [mm]."""
 ASKED = (0.5, 0.6, 0.7, 0.8)
@@ -167,6 +168,8 @@ def main() -> None:
     parser.add_argument("--time", action="store_true")
     parser.add_argument("--seeds", type=int, default=16)
     parser.add_argument("--scatter", type=float, default=0.01)
+    parser.add_argument("--step", type=float, default=0.05, help="of the critical strain")
+    parser.add_argument("--last", type=float, default=LAST, help="of the critical strain")
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()) / "watch")
     given = parser.parse_args()
     if given.memory:
@@ -184,7 +187,8 @@ def main() -> None:
     perfect = solved(Experiment(strains=(0.1,)), given.out / "perfect.h5")
     critical = perfect.info["critical"]["strain"]
     print(f"critical strain of the perfect specimen {100 * critical:.3f} %")
-    strains = tuple(np.round(critical * SHARES, 4))
+    shares = given.step * np.arange(1, round(given.last / given.step) + 1)
+    strains = tuple(np.round(critical * shares, 4))
     if given.time:
         part = Experiment(strains=strains[::4], imperfection=Imperfection(0.01, 0.01, 1))
         path = photographed(solved(part, given.out / "time.h5"), given.out / "time", PIXEL_SIZE, 1)
@@ -200,7 +204,7 @@ def main() -> None:
     found = []
     for seed in range(1, given.seeds + 1):
         scatter = Imperfection(given.scatter, given.scatter, seed)
-        name = f"{given.scatter:g}_{seed}"
+        name = f"{given.scatter:g}_{given.step:g}_{given.last:g}_{seed}"
         kept = given.out / f"{name}.json"  # a second run has them at once
         if not kept.is_file():
             experiment = Experiment(strains=strains, imperfection=scatter)
@@ -209,14 +213,14 @@ def main() -> None:
             kept.write_text(json.dumps(rows))
         rows = json.loads(kept.read_text())
         if seed == 1 and given.picture is not None:
-            draw(rows[: int((SHARES < 0.71).sum())], given.picture)
+            draw(rows[: int((shares < 0.71).sum())], given.picture)
         columns = WatchedTest(rows).columns
         predictions = follow_growth(columns)
         # What is measured is the strain of the cellular part, without the bulk at its edges.
         there = float(np.polyval(np.polyfit(strains, columns[0], 2), critical))
         line = [f"seed {seed}: {100 * there:.2f} %;"]
-        for share in ASKED:
-            k = int(np.flatnonzero(share + 1e-6 >= SHARES)[-1])
+        for share in (s for s in ASKED if s <= given.last):
+            k = int(np.flatnonzero(share + 1e-6 >= shares)[-1])
             at = predictions[k]
             if at is None:
                 line.append(f"{share:.0%} –")
@@ -226,7 +230,7 @@ def main() -> None:
             line.append(f"{share:.0%} {100 * at.critical:.2f} ({at.interval}; sd at least "
                         f"{100 * least:.1f} % of it)")  # fmt: skip
         print("  ".join(line), flush=True)
-    for share in ASKED:
+    for share in (s for s in ASKED if s <= given.last):
         ratio = np.array([r for s, r, _ in found if s == share])
         covered = [h for s, _, h in found if s == share]
         rms, most = np.sqrt(np.mean((ratio - 1) ** 2)), np.abs(ratio - 1).max()

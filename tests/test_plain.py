@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from contours import dots, painted
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import brentq
 
 from modeharvest.fem.field import Solution
@@ -19,12 +20,13 @@ from modeharvest.idic.finite_element.contours import (
     displacement_from_contours,
     straight_sides,
 )
+from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.photograph.plain import displacement_of_plain, matched_contours, plain_surface
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
-from modeharvest.imaging.photographs.contour import Contour, HoleShape
+from modeharvest.imaging.photographs.contour import Contour, HoleShape, SeenContours
 from modeharvest.imaging.photographs.files import read_image, read_mask, write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
@@ -239,6 +241,10 @@ def test_a_buckled_specimen_without_speckle(photographed: Path) -> None:
     sd = result.standard_deviation_on()[there] / px
     assert 0.9 < np.mean(np.abs(off) < 1.96 * sd) <= 1.0
     assert result.shown == "contours"
+    # It doesn't matter where the iteration begins: from a picture before, turned a little.
+    turned = result.displacement + 0.03 * body.mesh.nodes[:, ::-1] * [-1.0, 1.0]
+    again, _ = displacement_of_plain(surface, g, pair.grid, body, before=turned)
+    assert np.abs(again.displacement - result.displacement).max() < 0.02 * px
     # Holes are flattened along x and y in turn, as the pattern has it.
     flat = [abs(HoleShape.of(hole).orientation_deg) for _, hole in matched.holes]
     assert 25 <= np.sum(np.array(flat) < 30.0) <= 35
@@ -287,6 +293,57 @@ def test_measure_finds_by_itself_that_there_is_no_speckle(
     assert holes[0].startswith("reference x [mm],reference y up [mm],")
     assert read_json(tmp_path / "summary.json")["images"] == [image]
     assert "held to the contours" in (tmp_path / "report.html").read_text()
+
+
+def test_dots_belong_to_the_material_and_are_followed(photographed: Path, tmp_path: Path) -> None:
+    (pair,) = make_images(Solution.read(SHIPPED), PLAIN, photographed, (0.128,))
+    names = ["reference", "deformed_1280"]
+    pictures = [read_image(photographed / f"{name}_8bit.tif") for name in names]
+    grey = float(pictures[0][:3].mean())
+    for name, picture, edges in zip(names, pictures, dots(pair, 0.44), strict=True):
+        shown = painted(picture, edges, grey)
+        write_image(tmp_path / f"{name}.tif", np.rint(255.0 * shown).astype(np.uint8))
+    found = measure(tmp_path / "reference.tif", [tmp_path / "deformed_1280.tif"], tmp_path / "out",
+                    pixel_size=0.04)  # fmt: skip
+    assert any(text.startswith("45 dots are on the material") for text in found["warnings"])
+    results = tmp_path / "out/results"
+    assert len((results / "deformed_1280_holes.csv").read_text().splitlines()) == 1 + 60
+    x, y, _, _, _, x_g, y_g, *_ = np.loadtxt(
+        results / "deformed_1280_dots.csv", delimiter=",", skiprows=1, unpack=True
+    )
+    assert len(x) == 45
+    # The area around a dot and the finite elements say the same.
+    u, px = np.nan_to_num(pair.truth.displacement), PLAIN.pixel_size
+    at = np.stack(pair.grid.to_px(x, y))
+    true = [map_coordinates(u[..., k], at, order=1) for k in (0, 1)]
+    assert np.sqrt(np.mean((true - np.stack([x_g - x, y_g - y])) ** 2)) < 0.03 * px
+    measured = read_result(results / "deformed_1280.h5").displacement_on()
+    there = np.isfinite(pair.truth.displacement[..., 0]) & np.isfinite(measured[..., 0])
+    off = (measured - pair.truth.displacement)[there] / px
+    assert np.sqrt(np.mean(off**2)) < 0.06
+
+
+def test_a_dot_holds_what_is_around_it() -> None:
+    """Springs of contours of half its circumference, in both directions, and no edge of its own."""
+    rows, cols, t = 90, 100, np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    around = np.stack([np.cos(t), np.sin(t)], axis=1)
+    corners = np.array([[-20.0, -15.0], [20.0, -15.0], [20.0, 15.0], [-20.0, 15.0]])
+    along = np.linspace(0.0, 1.0, 40, endpoint=False)[:, None]
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    edge = Contour(np.vstack([a + (b - a) * along for a, b in sides]))
+    grid = PixelGrid.centred(rows, cols, 1.0)
+    x, y = np.meshgrid(grid.x, grid.y)
+    body = FiniteElementOptions(8.0, 8.0).body((np.abs(x) < 20.0) & (np.abs(y) < 15.0), grid)
+    moved = []
+    for shift in (0.0, 0.5):
+        pair = Contour(3.0 * around), Contour(3.0 * around + [shift, 0.0])
+        seen = SeenContours((edge,), (edge,), 1e-4, 1.0, (pair,))
+        found = displacement_from_contours(seen, body, grid, 0.0 * body.mesh.nodes)
+        moved.append(found.at(np.array([[0.0, 0.0], [15.0, 10.0]])))
+    assert np.abs(moved[0]).max() < 0.05
+    pulled = moved[1] - moved[0]
+    assert 0.3 < pulled[0, 0] < 0.5  # softer than the dot is known
+    assert np.abs(pulled[1]).max() < 0.2 * pulled[0, 0]
 
 
 def test_holes_that_are_not_found_again_leave_a_warning() -> None:

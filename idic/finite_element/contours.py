@@ -11,6 +11,8 @@ decide; where the law is right free edges have no traction, and the springs carr
 wrong law does is therefore small, and estimated: by how much laws of other compressibility change
 u. An edge that is straight and stays so is taken to be held by a plate on which it doesn't slide.
 Contours don't show whether it does; what sliding would change counts in the standard deviation.
+Dots on the material hold it where their centres are, by springs as stiff as those along a contour
+of half their circumference: a circle's centre is as well known as that, in each direction.
 
 Where an image's border cuts the body, unknown tractions hold it. Over each ligament that is cut, or
 piece of one cut lengthwise, they have two resultants and a moment, which are found as those with
@@ -25,7 +27,7 @@ from copy import copy
 from functools import partial
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -34,11 +36,12 @@ from modeharvest.fem.materials import JetMatrix, Material, Ogden, stress_and_tan
 from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.idic.finite_element.cutoff import Deviations
 from modeharvest.idic.finite_element.fields import interpolation_error, nodal_gradient
-from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.result import NodalResult, located
 from modeharvest.idic.finite_element.system import SAMPLES, SOME, Body, Imbalance
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.contour import Contour, SeenContours
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.elements import shape_functions
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
@@ -80,7 +83,7 @@ of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
 
 
 class _Edge:
-    """The points of a mesh's edge that are held to contours."""
+    """The points of a mesh's edge that are held to contours, and dots, in two directions each."""
 
     def __init__(self, mesh: Mesh, seen: SeenContours, grid: PixelGrid) -> None:
         t, pixel_size = _GAUSS, grid.pixel_size
@@ -105,7 +108,18 @@ class _Edge:
         self.cut = np.where(is_part, _cut_ligaments(mesh, sides, grid), -1).repeat(t.size)
         """(q,) number of the ligament that the image's border cuts, from 0; -1 elsewhere."""
         self.whole_length = self.length.copy()
-        self.length[~(np.abs(off) < _FAR_PX * pixel_size) | (self.cut >= 0)] = 0.0
+        self.is_tied = (np.abs(off) < _FAR_PX * pixel_size) & (self.cut < 0)
+        """(q,) whether a point of the edge is held."""
+        dots = np.array([[c.moments[1] for c in pair] for pair in seen.dots]).reshape(-1, 2, 2)
+        half = np.array([0.5 * contour.length for contour, _ in seen.dots])
+        self.length = np.append(np.where(self.is_tied, self.length, 0.0), half.repeat(2))
+        """(q + 2 p,) that each spring stands for [mm]: along the edge, then of p dots in x, y."""
+        self.dots_moved = dots[:, 1] - dots[:, 0]
+        element, xi = located(mesh, dots[:, 0], True)
+        own, size = mesh.cells[element], (len(dots), len(mesh.nodes))
+        of = np.arange(len(dots)).repeat(own.shape[1])
+        values = shape_functions(mesh.element, xi).ravel()
+        self.at_dots = csr_array((values, (of, own.ravel())), shape=size)
 
     def _distances(
         self, x: FloatArray, contours: Sequence[Contour]
@@ -141,17 +155,20 @@ class _Edge:
         return own, other
 
     def distances(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(q,) signed distances [mm] at displacements (n, 2), (q, 2) their gradients.
+        """(q + 2 p,) signed distances [mm] at displacements (n, 2), (q + 2 p, 2) their gradients.
 
         Both are 0 where a point has left the image.
         """
         d, normal = self._distances(self.points + self.shapes @ u, self.deformed)
-        return np.nan_to_num(d), normal
+        off = self.at_dots @ u - self.dots_moved
+        along = np.tile(np.eye(2), (len(off), 1))
+        return np.append(np.nan_to_num(d), off.ravel()), np.vstack([normal, along])
 
     def normal_shapes(self, normal: FloatArray) -> csr_array:
-        """(q, 2 n) what displacements are along the normals (q, 2)."""
-        shapes = self.shapes
-        data = shapes.data[:, None] * normal[np.repeat(np.arange(len(normal)), 3)]
+        """(q + 2 p, 2 n) what displacements are along the normals (q + 2 p, 2)."""
+        both = np.arange(self.at_dots.shape[0]).repeat(2)
+        shapes = csr_array(vstack([self.shapes, self.at_dots[both]], "csr"))
+        data = shapes.data[:, None] * normal.repeat(np.diff(shapes.indptr), axis=0)
         cols = 2 * shapes.indices[:, None] + np.arange(2)
         return csr_array(
             (data.ravel(), cols.ravel(), 2 * shapes.indptr), (len(normal), 2 * shapes.shape[1])
@@ -239,6 +256,10 @@ class _PenalisedBody:
         self.law = Imbalance(self.mesh, law, self._none)
         self.shear = float(stress_and_tangent(law, np.eye(2)[None])[1][0, 0, 1, 0, 1])
 
+    def distances(self) -> tuple[FloatArray, FloatArray]:
+        """Of edges and dots from where they are seen, and their gradients, as they are now."""
+        return self.edge.distances(self.u.reshape(-1, 2))
+
     def _deformation_gradient(self, u: FloatArray) -> FloatArray:
         """(m, q, 2, 2) F at the points of each element [-]."""
         cells = u.reshape(-1, 2)[self.mesh.cells]
@@ -260,7 +281,7 @@ class _PenalisedBody:
     def linearised(self) -> tuple[csr_array, csr_array, FloatArray]:
         """(2 n, 2 n) tangent stiffness, that of the springs in it, (2 n,) forces, all over mu."""
         f, K = self.law.forces(self.u)
-        d, normal = self.edge.distances(self.u.reshape(-1, 2))
+        d, normal = self.distances()
         B = self.edge.normal_shapes(normal)
         weighed = diags_array(self.stiffness * self.edge.length) @ B
         D, springs = self.plates, csr_array(B.T @ weighed)
@@ -306,7 +327,7 @@ class _PenalisedBody:
         converged = self.relax(springs, tolerance_px)
         for _ in range(_ROUNDS if self.tractions.size else 0):
             A, _, _ = self.linearised()
-            d, normal = self.edge.distances(self.u.reshape(-1, 2))
+            d, normal = self.distances()
             by_tractions, answer, kept = self.answers(self.factor(A), normal)
             more = answer @ d - kept @ self.tractions
             step = by_tractions @ more
@@ -339,23 +360,23 @@ class _PenalisedBody:
 
     def pressed_sides(self) -> tuple[IntArray, ...]:
         """The straight edges that something presses or pulls."""
-        d, normal = self.edge.distances(self.u.reshape(-1, 2))
+        d, normal = (part[: len(self.edge.points)] for part in self.distances())
         seen = self.edge.points + self.edge.shapes @ self.u.reshape(-1, 2) - d[:, None] * normal
         first = self.edge.shapes.indices.reshape(-1, 3)[:, 1]
         sides, tractions = [], []
         for nodes in straight_sides(self.mesh):
-            own = np.isin(first, nodes) & (self.edge.length > 0.0)
+            own = np.isin(first, nodes) & self.edge.is_tied
             tied = 2 * own.sum() > np.isin(first, nodes).sum()
             if tied and _bend(seen[own]) < _STAYS_STRAIGHT:
                 sides.append(nodes)
-                tractions.append(abs(np.average(d[own], weights=self.edge.length[own])))
+                tractions.append(abs(np.average(d[own], weights=self.edge.whole_length[own])))
         most = max(tractions, default=0.0)
         return tuple(s for s, t in zip(sides, tractions, strict=True) if t > _LOADED * most)
 
     def press(self, sides: Sequence[IntArray], *, slides: bool) -> None:
         """Let plates press straight edges, which keep their length unless they slide."""
         first = self.edge.shapes.indices.reshape(-1, 3)[:, 1]
-        self.pressed = [np.isin(first, nodes) & (self.edge.length > 0.0) for nodes in sides]
+        self.pressed = [np.isin(first, nodes) & self.edge.is_tied for nodes in sides]
         if slides or not sides:
             return
         ends = np.vstack([np.stack([nodes[:-1], nodes[1:]], axis=1) for nodes in sides])
@@ -374,9 +395,9 @@ class _PenalisedBody:
 
     def take_up(self, stiffer: float) -> None:
         """Take up by how much springs give way under plates once they are so many times stiffer."""
-        d, _ = self.edge.distances(self.u.reshape(-1, 2))
+        d = self.distances()[0][: len(self.edge.points)]
         for own in self.pressed:
-            self.edge.off[own] -= np.average(d[own], weights=self.edge.length[own]) / stiffer
+            self.edge.off[own] -= np.average(d[own], weights=self.edge.whole_length[own]) / stiffer
 
     def change_by(self, law: Material | None = None, slides: bool = False) -> FloatArray:
         """(n, 2) by how much another law, or edges that slide, would change u [mm], about."""
@@ -398,14 +419,14 @@ class _PenalisedBody:
         """
         if not self.tractions.size:
             return u
-        _, normal = self.edge.distances(self.u.reshape(-1, 2))
+        _, normal = self.distances()
         by_tractions, answer, _ = self.answers(factor, normal)
         off = self.edge.normal_shapes(normal) @ u - noise
         return np.asarray(u + by_tractions @ (answer @ off))
 
     def by_other_tractions(self, factor: Factor, count: int) -> FloatArray:
         """(n, 2, count) what random tractions at cuts do, uneven or not shown by contours."""
-        _, normal = self.edge.distances(self.u.reshape(-1, 2))
+        _, normal = self.distances()
         by_tractions, answer, kept = self.answers(factor, normal)
         shape = 2, self.tractions.size, count
         z = self.stress() * np.random.default_rng(1).standard_normal(shape)
@@ -457,7 +478,7 @@ def displacement_from_contours(
         sd, known = _deviations(state, seen.noise, law is None, bool(sides) and not slides, left)
     except ArithmeticError as error:
         raise InputError(f"expected contours that hold the body, got others: {_ASTRAY}") from error
-    d, _ = state.edge.distances(u)
+    d, _ = state.distances()
     return NodalResult(
         mesh=mesh,
         displacement=u,
@@ -486,7 +507,7 @@ def _deviations(
     """Standard deviations by noise, law, plates, springs; how many unknowns contours determine."""
     mesh, edge, rng = state.mesh, state.edge, np.random.default_rng(0)
     A, springs, _ = state.linearised()
-    _, normal = edge.distances(state.u.reshape(-1, 2))
+    _, normal = state.distances()
     weighed = diags_array(state.stiffness * np.sqrt(edge.length * noise)) @ edge.normal_shapes(
         normal
     )

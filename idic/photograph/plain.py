@@ -1,4 +1,4 @@
-"""Photographs of a plain specimen, without speckle: its material, its contours, its holes.
+"""Photographs of a plain specimen, without speckle: its material, its contours, holes and dots.
 
 Such a picture has two grey levels, and its information is where they meet. Contours are taken at
 half-way between the levels around, which may vary slowly over the picture, after a blur of less
@@ -64,6 +64,9 @@ _SHARPEST = 1.0 / 3.0
 """Largest curvature [1/px]: that of a corner is no radius."""
 _LEAST_PX2 = 60.0
 """Area of a hole or island; smaller ones are dirt."""
+_DOT, _DOT_GROWS = 1.0 / 6.0, 1.8
+"""Area over that of the largest hole of what is a dot on the material, at most, and over that of
+the reference's largest dot in another picture, where holes may be nearly closed."""
 _CLEAR = 0.02
 """Share of the picture's border that dirt may be taken for."""
 _SHORTEST_CUT = 24
@@ -79,6 +82,10 @@ _CONTOURS = (
 _CUT = (
     "Not all of the specimen is in view: what holds it where the picture cuts it isn't known, so "
     "that nothing is said within a hole's distance of there."
+)
+_DOTS = (
+    "{} dots are on the material: what its edges surround of less than a sixth of the largest "
+    "hole's area is taken for one; give a mask if these are holes."
 )
 _LEFT = "Some of the specimen has left the picture: what is there follows from a law alone."
 _GROWING = np.array([4.0, 6.0, 9.0, 14.0, 20.0, 30.0, np.inf, np.inf])
@@ -103,6 +110,17 @@ class PlainSurface:
     """Whether there are other specimens in the picture, and whether all of this one is."""
     cut: tuple[FloatArray, ...] = ()
     """Those that the picture's border cuts; none if all of the specimen is in view."""
+    dots: tuple[FloatArray, ...] = ()
+    """(n, 2) points (row, col) [px] around marks on the material, which belong to it."""
+
+    @property
+    def largest_dot(self) -> float:
+        """Area [px^2]; 0 without."""
+        return max((abs(signed_area(points)) for points in self.dots), default=0.0)
+
+    def dots_on(self, grid: PixelGrid) -> list[Contour]:
+        """Contours of dots in a grid's frame [mm]."""
+        return [Contour(np.column_stack(grid.to_mm(*points.T))) for points in self.dots]
 
     def on(self, grid: PixelGrid) -> tuple[list[Contour], list[Contour], list[Contour]]:
         """Outer contours, those of holes, and those that are cut, in a grid's frame [mm]."""
@@ -112,11 +130,14 @@ class PlainSurface:
         return closed[:outer], closed[outer:], cut
 
 
-def plain_surface(image: FloatImage, like: BoolArray | None = None) -> PlainSurface | None:
+def plain_surface(
+    image: FloatImage, like: BoolArray | None = None, dot_px2: float | None = None
+) -> PlainSurface | None:
     """What a picture (rows, cols) shows if it shows a plain material; None if it has speckle.
 
     Of several specimens the largest is taken, or the one where ``like`` is True. One that reaches
-    the picture's border is in view in part: its contours end there.
+    the picture's border is in view in part: its contours end there. Contours within the material of
+    an area [px^2] below ``dot_px2``, by default a sixth of the largest hole's, are dots on it.
     """
     grey = gaussian_filter(np.asarray(image, dtype=np.float32), _BLUR_PX)
     few = max(1, min(grey.shape) // _COARSE_PX)
@@ -133,6 +154,10 @@ def plain_surface(image: FloatImage, like: BoolArray | None = None) -> PlainSurf
         return None
     if cut:
         text += (_CUT,)
+    contours, dots, most = _without_dots(contours, 0 if cut else 1, dot_px2)
+    if dots:
+        material = _filled(material, most)
+        text += (_DOTS.format(len(dots)),)
     slope = _slope(grey, contours + cut)
     # White noise of the pixels, blurred: its variance at a point times its correlation length.
     noise = estimated_noise(image, material).sd ** 2 / _CORRELATED_PX
@@ -141,7 +166,30 @@ def plain_surface(image: FloatImage, like: BoolArray | None = None) -> PlainSurf
     variance = max(0.0, blur**2 - _DIFFERENCE_PX2)
     sharp = tuple(_unbent(Contour(points), variance) for points in contours)
     ends = tuple(_unbent(Contour(points, False), variance) for points in cut)
-    return PlainSurface(material, sharp, noise / slope**2, text, ends)
+    marks = tuple(_unbent(Contour(points), variance) for points in dots)
+    return PlainSurface(material, sharp, noise / slope**2, text, ends, marks)
+
+
+def _without_dots(
+    contours: tuple[FloatArray, ...], outer: int, most: float | None
+) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], float]:
+    """Closed contours, the largest first, less those of dots; these, and what parts them [px^2]."""
+    areas = np.abs([signed_area(points) for points in contours])
+    if most is None:
+        most = _DOT * float(areas[outer:].max(initial=0.0))
+    first = max(outer, int((areas >= most).sum()))
+    if first == outer or first == len(contours):  # dots alone might as well be holes
+        return contours, (), most
+    return contours[:first], contours[first:], float(np.sqrt(areas[first - 1] * areas[first]))
+
+
+def _filled(material: BoolArray, area: float) -> BoolArray:
+    """The material with what it surrounds of less than an area [px^2]."""
+    parts, _ = label(~material)
+    small = np.bincount(parts.ravel()) < area
+    small[parts[[0, -1]]] = small[parts[:, [0, -1]]] = False
+    small[0] = False
+    return np.asarray(material | small[parts])
 
 
 def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | None:
@@ -269,6 +317,11 @@ class MatchedContours:
     lost: int
     """Holes of the reference that weren't found in the deformed picture."""
 
+    @property
+    def dots(self) -> tuple[tuple[Contour, Contour], ...]:
+        """Those found in both pictures."""
+        return self.seen.dots
+
     def start(self, points: FloatArray) -> FloatArray:
         """(n, 2) displacement of points (n, 2) [mm] by the affine motion."""
         return np.column_stack([points, np.ones(len(points))]) @ self.affine
@@ -307,10 +360,11 @@ def matched_contours(
     left_g = [hole for k, hole in enumerate(others) if k not in taken]
     rest, rest_g = [*cut, *left, *outer], [*cut_g, *left_g, *outer_g]
     arcs = () if whole else _paired_arcs(rest, rest_g, affine, _ALIKE * _spacing(a))
+    dots = _paired_dots(reference.dots_on(grid), deformed.dots_on(grid), affine)
     every = (*zip(outer, outer_g, strict=False), *found) if whole else (*found, *arcs)
     noise = (reference.noise + deformed.noise) * grid.pixel_size**3
     sides = tuple(c for c, _ in every), tuple(c for _, c in every)
-    seen = SeenContours(*sides, noise, _CORRELATED_PX * grid.pixel_size)
+    seen = SeenContours(*sides, noise, _CORRELATED_PX * grid.pixel_size, dots)
     lost = len(left) - sum(any(c is hole for hole in left) for c, _ in arcs)
     return MatchedContours(seen, affine, found, lost)
 
@@ -332,9 +386,28 @@ def _paired_arcs(
     return tuple(found)
 
 
+def _paired_dots(
+    f: Sequence[Contour], g: Sequence[Contour], affine: FloatArray
+) -> tuple[tuple[Contour, Contour], ...]:
+    """Dots in two pictures that are the same: where the holes' affine motion takes them, about."""
+    if not (f and g):
+        return ()
+    a, b = (np.array([contour.moments[1] for contour in side]) for side in (f, g))
+    reach = _ALIKE * _spacing(a) if len(a) > 1 else np.inf
+    there = a + np.column_stack([a, np.ones(len(a))]) @ affine
+    distance = np.linalg.norm(there[:, None] - b, axis=2)
+    i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
+    return tuple((f[k], g[m]) for k, m in zip(i, j, strict=True) if distance[k, m] < reach)
+
+
 def _spacing(a: FloatArray) -> float:
     """Median distance of points (n, 2) to their nearest."""
     return float(np.median(cKDTree(a).query(a, k=2)[0][:, 1]))
+
+
+def _affine_part(points: FloatArray, u: FloatArray) -> FloatArray:
+    """(n, 2) the affine displacement nearest to u (n, 2)."""
+    return np.asarray(np.column_stack([points, np.ones(len(points))]) @ _affine(points, points + u))
 
 
 def _affine(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -383,13 +456,15 @@ def displacement_of_plain(
     body: Body,
     progress: Progress = silent,
     name: str = "the picture",
+    before: FloatArray | None = None,
 ) -> tuple[NodalResult, MatchedContours]:
     """The displacement in another picture (rows, cols) of a plain specimen, and its contours.
 
-    ``body``: a mesh of the reference's material. InputError, in which the picture has a name, if it
-    shows no plain specimen, or another one.
+    ``body``: a mesh of the reference's material; ``before``: (n, 2) displacement of its nodes [mm]
+    in the picture before, which the iteration begins from, by default an affine motion. InputError,
+    in which the picture has a name, if it shows no plain specimen, or another one.
     """
-    deformed = plain_surface(image, reference.mask)
+    deformed = plain_surface(image, reference.mask, _DOT_GROWS * reference.largest_dot)
     if deformed is None:
         raise InputError(
             f"expected two grey levels in {name}, like the reference's, got more: a plain specimen "
@@ -397,6 +472,8 @@ def displacement_of_plain(
         )
     matched = matched_contours(reference, deformed, grid)
     start = matched.start(body.mesh.nodes)
+    if before is not None and len(before) == len(start):
+        start = start + before - _affine_part(body.mesh.nodes, before)
     found = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
     if reference.cut:
         centres = np.array([hole.moments[1] for hole, _ in matched.holes])
@@ -433,18 +510,21 @@ def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalR
 def measure_contours(
     reference: PlainSurface, pair: ImagePair, name: str, geometry: Geometry, cell_size: float,
     how: PhotographOptions, body: Body, progress: Progress = silent,
+    before: MeasuredPhotograph | None = None,
 ) -> tuple[MeasuredPhotograph, MatchedContours]:  # fmt: skip
     """Measure a photograph of a specimen without speckle, by its contours, and the modes in it.
 
     The result is the ansatz fitted to the displacement that contours determine, its covariance that
     by noise; the refitted ansatz' is by all that this displacement is uncertain by, laws and plates
     included. ``reference``: what the pair's reference shows; ``name``: of the photograph, for
-    messages; for the rest see :func:`~modeharvest.idic.photograph.measure.measure`. InputError if
-    the photograph shows no such specimen, or the spectrum contradicts the cell size.
+    messages; ``before``: the photograph before it, for a start; for the rest see
+    :func:`~modeharvest.idic.photograph.measure.measure`. InputError if the photograph shows no such
+    specimen, or the spectrum contradicts the cell size.
     """
     measured, contours = displacement_of_plain(
-        reference, pair.deformed, geometry.grid, body, progress, name
-    )
+        reference, pair.deformed, geometry.grid, body, progress, name,
+        before.whole.measured.displacement if before and before.whole else None,
+    )  # fmt: skip
     guess, ansatz, unknowns, text = found_modes(
         pair, geometry, cell_size, how, measured.at_points(cell_size / POINTS_A_CELL)
     )
@@ -457,13 +537,25 @@ def measure_contours(
     return MeasuredPhotograph(result, guess.local, text, whole, measured.warnings), contours
 
 
-def write_holes(path: Path, matched: MatchedContours, unit: str = "mm") -> None:
-    """Write the holes' shapes in both pictures as a table (CSV), atomically."""
+def write_shapes(
+    folder: Path, name: str, matched: MatchedContours, unit: str = "mm"
+) -> tuple[Path, ...]:
+    """Write the holes' and the dots' shapes in both pictures as tables (CSV), atomically.
+
+    Returns ``NAME_holes.csv``, and ``NAME_dots.csv`` if there are some.
+    """
+    kinds = {"holes": matched.holes} | ({"dots": matched.dots} if matched.dots else {})
+    for kind, pairs in kinds.items():
+        _write_pairs(folder / f"{name}_{kind}.csv", pairs, unit)
+    return tuple(folder / f"{name}_{kind}.csv" for kind in kinds)
+
+
+def _write_pairs(path: Path, pairs: Sequence[tuple[Contour, Contour]], unit: str) -> None:
     own = f"x [{unit}]", f"y up [{unit}]", f"area [{unit}^2]"
     heads = (*own, "ellipticity [-]", "orientation [degrees]")
     with atomic(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow([f"{when} {head}" for when in ("reference", "deformed") for head in heads])
-        for pair in matched.holes:
+        for pair in pairs:
             values = [value for hole in pair for value in astuple(HoleShape.of(hole))]
             table.writerow([f"{value:.6g}" for value in values])

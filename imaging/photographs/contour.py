@@ -95,6 +95,8 @@ class SeenContours:
     """Variance of their distance times the length over which it is correlated [mm^3]."""
     correlated: float
     """That length [mm]."""
+    dots: tuple[tuple[Contour, Contour], ...] = ()
+    """Around marks on the material, in the reference and in the deformed image [mm]."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ from modeharvest.idic.photograph.plain import (
     PlainSurface,
     displacement_of_plain,
     plain_surface,
-    write_holes,
+    write_shapes,
 )
 from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
@@ -291,16 +291,15 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _measured(
         self, name: str, before: NodalResult | None, folder: Path
     ) -> tuple[NodalResult, *tuple[Path, ...]]:
-        """Measure an image; leaves a table of the holes where there is no speckle."""
+        """Measure an image; leaves tables of holes and dots where there is no speckle."""
         pair, body = self.pair(name), self._body
         if self.plain is not None:
             path = str(self.case.files[name])
             found, contours = displacement_of_plain(
-                self.plain, pair.deformed, self.grid, body, self.progress, path
-            )
-            holes = folder / f"{name}_holes.csv"
-            write_holes(holes, contours, self.case.unit)
-            return found, holes
+                self.plain, pair.deformed, self.grid, body, self.progress, path,
+                None if before is None else before.displacement,
+            )  # fmt: skip
+            return found, *write_shapes(folder, name, contours, self.case.unit)
         names = str(self.case.reference), str(self.case.files[name])
         known = 0.0 * body.mesh.nodes if before is None else before.displacement
         start, light = block_motion(pair, body, known, names), self.case.brightness

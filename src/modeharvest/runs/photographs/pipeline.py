@@ -6,7 +6,7 @@
     prepared/                           prepare     photographs without distortion, masks
     results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
     results/NAME_start.json                         where it started from, in words
-    results/NAME_holes.csv                          the holes' shapes, where there is no speckle
+    results/NAME_holes.csv  NAME_dots.csv           shapes of holes, where there is no speckle
     whole_field/NAME.h5  NAME.vtu                   whole displacements, where they are asked for
     whole_field/NAME_refit.json                     the ansatz of the result, refitted to it
     contours/NAME.json                  contours    the same by contours beside speckle, if wanted
@@ -46,7 +46,7 @@ from modeharvest.idic.photograph.plain import (
     PlainSurface,
     measure_contours,
     plain_surface,
-    write_holes,
+    write_shapes,
 )
 from modeharvest.idic.photograph.speckled_edges import (
     ByContours,
@@ -229,7 +229,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         ) -> tuple[Sequence[Path], dict[str, Any]]:
             result, field, _ = self._paths(name)
             if self._plain is not None:
-                measured, files = self._by_contours(name, self._plain)
+                measured, files = self._by_contours(name, self._plain, last and last[1])
             else:
                 measured, files = self._correlated_pair(name, last)
             write_field(field, measured.local)
@@ -301,16 +301,16 @@ class HarvestRun(StagedRun[PhotographCase]):
         return plain_surface(self.prepared.image())
 
     def _by_contours(
-        self, name: str, plain: PlainSurface
+        self, name: str, plain: PlainSurface, before: MeasuredPhotograph | None
     ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
         """A photograph that was measured by its contours, and the files of that."""
-        case, (body, _), holes = self.case, self._mesh, self.folder / f"results/{name}_holes.csv"
+        case, (body, _) = self.case, self._mesh
         found, contours = measure_contours(
             plain, self.prepared.pair(name), name, self.geometry, case.specimen.cell_size,
-            case.correlation, body, self.progress,
+            case.correlation, body, self.progress, before,
         )  # fmt: skip
-        write_holes(holes, contours)
-        return found, (holes, *self._whole_files(name, found))
+        shapes = write_shapes(self.folder / "results", name, contours)
+        return found, (*shapes, *self._whole_files(name, found))
 
     def _gauges(self) -> list[dict[str, Any]]:
         """What gauges read in every whole displacement; leaves ``gauges.csv``."""
