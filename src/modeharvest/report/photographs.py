@@ -331,7 +331,8 @@ def _gauge_cards(summary: Summary, states: Sequence[PhotographState]) -> list[Ca
     """What gauges read, and where they are on the last photograph that has a whole displacement."""
     rows, placed = summary.get("gauges", ()), None
     read = {row["image"] for row in rows}
-    strains = {f["name"]: f["strain_x"] for f in summary["frames"] if f["name"] in read}
+    # In a harvest compression is positive, in what gauges read tension.
+    strains = {f["name"]: -f["strain_x"] for f in summary["frames"] if f["name"] in read}
     if rows and states and (whole := states[-1].frame.whole):
         image, gauges = states[-1].frame.image, states[-1].harvest.case.gauges
         placed = partial(draw_gauges_on, whole.measured, gauges, image / image.max(), "mm")

@@ -10,9 +10,9 @@ import glob
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
-from pydantic import AfterValidator, PrivateAttr
+from pydantic import PrivateAttr, field_validator
 
 from modeharvest.idic.local.subsets import SubsetOptions
 from modeharvest.idic.photograph.gauges import Gauge, distinct
@@ -173,11 +173,16 @@ class PhotographCase(CaseModel):
     correlation: PhotographOptions = PhotographOptions()
     whole_field: WholeFieldOptions = WholeFieldOptions()
     contours: ContourTable = ContourTable()
-    gauges: Annotated[tuple[Gauge, ...], AfterValidator(distinct)] = ()
+    gauges: tuple[Gauge, ...] = ()
 
     _base: Path = PrivateAttr(Path())
     _written: Images | None = PrivateAttr(None)
     _sequence: ChosenFrames | None = PrivateAttr(None)
+
+    @field_validator("gauges")
+    @classmethod
+    def _distinct(cls, gauges: tuple[Gauge, ...]) -> tuple[Gauge, ...]:
+        return distinct(gauges)
 
     @property
     def base(self) -> Path:
