@@ -120,6 +120,8 @@ class _Edge:
         of = np.arange(len(dots)).repeat(own.shape[1])
         values = shape_functions(mesh.element, xi).ravel()
         self.at_dots = csr_array((values, (of, own.ravel())), shape=size)
+        both = np.arange(len(dots)).repeat(2)
+        self._springs = csr_array(vstack([self.shapes, self.at_dots[both]], "csr"))
 
     def _distances(
         self, x: FloatArray, contours: Sequence[Contour]
@@ -166,8 +168,7 @@ class _Edge:
 
     def normal_shapes(self, normal: FloatArray) -> csr_array:
         """(q + 2 p, 2 n) what displacements are along the normals (q + 2 p, 2)."""
-        both = np.arange(self.at_dots.shape[0]).repeat(2)
-        shapes = csr_array(vstack([self.shapes, self.at_dots[both]], "csr"))
+        shapes = self._springs
         data = shapes.data[:, None] * normal.repeat(np.diff(shapes.indptr), axis=0)
         cols = 2 * shapes.indices[:, None] + np.arange(2)
         return csr_array(

@@ -7,14 +7,14 @@ than a pixel. What blur moves curved edges by, its variance over twice their rad
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import gaussian_filter, label
+from scipy.ndimage import binary_fill_holes, gaussian_filter, label
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import savgol_filter
 from scipy.spatial import cKDTree
@@ -32,9 +32,9 @@ from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.contour import Contour, HoleShape, SeenContours, signed_area
-from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import atomic
+from modeharvest.util.files import write_csv
 from modeharvest.util.masks import large_parts, shrunk
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.typed import picked
@@ -113,21 +113,15 @@ class PlainSurface:
     dots: tuple[FloatArray, ...] = ()
     """(n, 2) points (row, col) [px] around marks on the material, which belong to it."""
 
-    @property
-    def largest_dot(self) -> float:
-        """Area [px^2]; 0 without."""
-        return max((abs(signed_area(points)) for points in self.dots), default=0.0)
-
-    def dots_on(self, grid: PixelGrid) -> list[Contour]:
-        """Contours of dots in a grid's frame [mm]."""
-        return [Contour(np.column_stack(grid.to_mm(*points.T))) for points in self.dots]
-
-    def on(self, grid: PixelGrid) -> tuple[list[Contour], list[Contour], list[Contour]]:
-        """Outer contours, those of holes, and those that are cut, in a grid's frame [mm]."""
-        closed = [Contour(np.column_stack(grid.to_mm(*points.T))) for points in self.contours]
-        cut = [Contour(np.column_stack(grid.to_mm(*points.T)), False) for points in self.cut]
+    def on(self, grid: PixelGrid) -> tuple[list[Contour], ...]:
+        """Outer contours, those of holes, of cuts, and of dots, in a grid's frame [mm]."""
+        kinds = (self.contours, True), (self.cut, False), (self.dots, True)
+        closed, cut, dots = (
+            [Contour(np.column_stack(grid.to_mm(*points.T)), whole) for points in part]
+            for part, whole in kinds
+        )
         outer = 0 if cut else 1
-        return closed[:outer], closed[outer:], cut
+        return closed[:outer], closed[outer:], cut, dots
 
 
 def plain_surface(
@@ -156,7 +150,6 @@ def plain_surface(
         text += (_CUT,)
     contours, dots, most = _without_dots(contours, 0 if cut else 1, dot_px2)
     if dots:
-        material = _filled(material, most)
         text += (_DOTS.format(len(dots)),)
     slope = _slope(grey, contours + cut)
     # White noise of the pixels, blurred: its variance at a point times its correlation length.
@@ -167,7 +160,9 @@ def plain_surface(
     sharp = tuple(_unbent(Contour(points), variance) for points in contours)
     ends = tuple(_unbent(Contour(points, False), variance) for points in cut)
     marks = tuple(_unbent(Contour(points), variance) for points in dots)
-    return PlainSurface(material, sharp, noise / slope**2, text, ends, marks)
+    # Noise and grey level are those beside dots, which are material all the same.
+    mask = _filled(material, most) if dots else material
+    return PlainSurface(mask, sharp, noise / slope**2, text, ends, marks)
 
 
 def _without_dots(
@@ -185,11 +180,8 @@ def _without_dots(
 
 def _filled(material: BoolArray, area: float) -> BoolArray:
     """The material with what it surrounds of less than an area [px^2]."""
-    parts, _ = label(~material)
-    small = np.bincount(parts.ravel()) < area
-    small[parts[[0, -1]]] = small[parts[:, [0, -1]]] = False
-    small[0] = False
-    return np.asarray(material | small[parts])
+    inside = binary_fill_holes(material) & ~material
+    return np.asarray(material | (inside & ~large_parts(inside, area)))
 
 
 def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | None:
@@ -317,14 +309,9 @@ class MatchedContours:
     lost: int
     """Holes of the reference that weren't found in the deformed picture."""
 
-    @property
-    def dots(self) -> tuple[tuple[Contour, Contour], ...]:
-        """Those found in both pictures."""
-        return self.seen.dots
-
     def start(self, points: FloatArray) -> FloatArray:
         """(n, 2) displacement of points (n, 2) [mm] by the affine motion."""
-        return np.column_stack([points, np.ones(len(points))]) @ self.affine
+        return _affinely(points, self.affine)
 
 
 def matched_contours(
@@ -335,7 +322,8 @@ def matched_contours(
     InputError if fewer than half of the holes are found, or fewer than three in a part of a
     specimen. Contours that are cut are looked for where the holes' affine motion takes them.
     """
-    (outer, holes, cut), (outer_g, others, cut_g) = reference.on(grid), deformed.on(grid)
+    outer, holes, cut, dots = reference.on(grid)
+    outer_g, others, cut_g, dots_g = deformed.on(grid)
     whole = bool(outer and outer_g)
     a = np.array([hole.moments[1] for hole in holes]).reshape(-1, 2)
     b = np.array([hole.moments[1] for hole in others]).reshape(-1, 2)
@@ -360,11 +348,11 @@ def matched_contours(
     left_g = [hole for k, hole in enumerate(others) if k not in taken]
     rest, rest_g = [*cut, *left, *outer], [*cut_g, *left_g, *outer_g]
     arcs = () if whole else _paired_arcs(rest, rest_g, affine, _ALIKE * _spacing(a))
-    dots = _paired_dots(reference.dots_on(grid), deformed.dots_on(grid), affine)
     every = (*zip(outer, outer_g, strict=False), *found) if whole else (*found, *arcs)
     noise = (reference.noise + deformed.noise) * grid.pixel_size**3
     sides = tuple(c for c, _ in every), tuple(c for _, c in every)
-    seen = SeenContours(*sides, noise, _CORRELATED_PX * grid.pixel_size, dots)
+    seen = SeenContours(*sides, noise, _CORRELATED_PX * grid.pixel_size,
+                        _paired_dots(dots, dots_g, affine))  # fmt: skip
     lost = len(left) - sum(any(c is hole for hole in left) for c, _ in arcs)
     return MatchedContours(seen, affine, found, lost)
 
@@ -375,8 +363,7 @@ def _paired_arcs(
     """Of contours in two pictures those that are the same, one at least of each pair being cut."""
     trees, found = [cKDTree(contour.points) for contour in g], []
     for contour in f:
-        x = np.column_stack([contour.points, np.ones(len(contour.points))])
-        x = contour.points + x @ affine
+        x = contour.points + _affinely(contour.points, affine)
         far = [
             float(np.median(tree.query(x)[0])) if not (contour.closed and other.closed) else np.inf
             for tree, other in zip(trees, g, strict=True)
@@ -394,10 +381,8 @@ def _paired_dots(
         return ()
     a, b = (np.array([contour.moments[1] for contour in side]) for side in (f, g))
     reach = _ALIKE * _spacing(a) if len(a) > 1 else np.inf
-    there = a + np.column_stack([a, np.ones(len(a))]) @ affine
-    distance = np.linalg.norm(there[:, None] - b, axis=2)
-    i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
-    return tuple((f[k], g[m]) for k, m in zip(i, j, strict=True) if distance[k, m] < reach)
+    pairs = _assigned(a + _affinely(a, affine), b, reach)
+    return tuple((f[i], g[j]) for i, j in pairs)
 
 
 def _spacing(a: FloatArray) -> float:
@@ -405,14 +390,21 @@ def _spacing(a: FloatArray) -> float:
     return float(np.median(cKDTree(a).query(a, k=2)[0][:, 1]))
 
 
-def _affine_part(points: FloatArray, u: FloatArray) -> FloatArray:
-    """(n, 2) the affine displacement nearest to u (n, 2)."""
-    return np.asarray(np.column_stack([points, np.ones(len(points))]) @ _affine(points, points + u))
-
-
 def _affine(a: FloatArray, b: FloatArray) -> FloatArray:
     """(3, 2) the affine displacement of points a to points b (n, 2)."""
     return np.asarray(np.linalg.lstsq(np.column_stack([a, np.ones(len(a))]), b - a)[0])
+
+
+def _affinely(points: FloatArray, affine: FloatArray) -> FloatArray:
+    """(n, 2) an affine displacement (3, 2) of points (n, 2)."""
+    return np.asarray(np.column_stack([points, np.ones(len(points))]) @ affine)
+
+
+def _assigned(a: FloatArray, b: FloatArray, reach: float) -> IntArray:
+    """(k, 2) which of the points a (n, 2) is which of b (m, 2), nearer than a reach."""
+    distance = np.linalg.norm(a[:, None] - b, axis=2)
+    i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
+    return np.asarray(np.stack([i, j], axis=1)[distance[i, j] < reach])
 
 
 def _paired(a: FloatArray, b: FloatArray, whole: bool) -> list[tuple[int, int]]:
@@ -422,14 +414,11 @@ def _paired(a: FloatArray, b: FloatArray, whole: bool) -> list[tuple[int, int]]:
     """
     reach = _ALIKE * _spacing(a)
     there, far = (_laid_over(a, b, reach), [np.inf] * _ROUNDS) if whole else (a, _GROWING * reach)
-    pairs = np.empty((0, 2), dtype=np.int64)
     for radius in far:
-        distance = np.linalg.norm(there[:, None] - b, axis=2)
-        i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
-        ok = (distance[i, j] < reach) & (np.linalg.norm(a[i], axis=1) < radius)
-        pairs = np.stack([i[ok], j[ok]], axis=1)
+        pairs = _assigned(there, b, reach)
+        pairs = pairs[np.linalg.norm(a[pairs[:, 0]], axis=1) < radius]
         if len(pairs) > 2:
-            there = a + np.column_stack([a, np.ones(len(a))]) @ _affine(a[i[ok]], b[j[ok]])
+            there = a + _affinely(a, _affine(a[pairs[:, 0]], b[pairs[:, 1]]))
     return [(int(i), int(j)) for i, j in pairs]
 
 
@@ -464,17 +453,15 @@ def displacement_of_plain(
     in the picture before, which the iteration begins from, by default an affine motion. InputError,
     in which the picture has a name, if it shows no plain specimen, or another one.
     """
-    deformed = plain_surface(image, reference.mask, _DOT_GROWS * reference.largest_dot)
+    dot_px2 = max((abs(signed_area(points)) for points in reference.dots), default=0.0)
+    deformed = plain_surface(image, reference.mask, _DOT_GROWS * dot_px2)
     if deformed is None:
         raise InputError(
             f"expected two grey levels in {name}, like the reference's, got more: a plain specimen "
             "can't be found there; light it evenly, or give a mask if it has speckle"
         )
     matched = matched_contours(reference, deformed, grid)
-    start = matched.start(body.mesh.nodes)
-    if before is not None and len(before) == len(start):
-        start = start + before - _affine_part(body.mesh.nodes, before)
-    found = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
+    found = _after(matched, body, grid, before, progress)
     if reference.cut:
         centres = np.array([hole.moments[1] for hole, _ in matched.holes])
         found = _away_from_cuts(found, reference.mask, _spacing(centres))
@@ -484,6 +471,22 @@ def displacement_of_plain(
     if deformed.cut and not reference.cut:
         found = replace(found, warnings=(*found.warnings, _LEFT))
     return found, matched
+
+
+def _after(
+    matched: MatchedContours, body: Body, grid: PixelGrid, before: FloatArray | None,
+    progress: Progress,
+) -> NodalResult:  # fmt: skip
+    """From the picture before, its affine part that of now; where that leads astray, without."""
+    nodes = body.mesh.nodes
+    start, found = matched.start(nodes), None
+    if before is not None and len(before) == len(nodes):  # of a part in view fewer are known
+        there = start + before - _affinely(nodes, _affine(nodes, nodes + before))
+        with suppress(InputError):
+            found = displacement_from_contours(matched.seen, body, grid, there, progress=progress)
+    if found is None or found.warnings:
+        found = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
+    return found
 
 
 def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
@@ -544,18 +547,12 @@ def write_shapes(
 
     Returns ``NAME_holes.csv``, and ``NAME_dots.csv`` if there are some.
     """
-    kinds = {"holes": matched.holes} | ({"dots": matched.dots} if matched.dots else {})
-    for kind, pairs in kinds.items():
-        _write_pairs(folder / f"{name}_{kind}.csv", pairs, unit)
-    return tuple(folder / f"{name}_{kind}.csv" for kind in kinds)
-
-
-def _write_pairs(path: Path, pairs: Sequence[tuple[Contour, Contour]], unit: str) -> None:
-    own = f"x [{unit}]", f"y up [{unit}]", f"area [{unit}^2]"
-    heads = (*own, "ellipticity [-]", "orientation [degrees]")
-    with atomic(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow([f"{when} {head}" for when in ("reference", "deformed") for head in heads])
-        for pair in pairs:
-            values = [value for hole in pair for value in astuple(HoleShape.of(hole))]
-            table.writerow([f"{value:.6g}" for value in values])
+    lengths = f"x [{unit}]", f"y up [{unit}]", f"area [{unit}^2]"
+    own = (*lengths, "ellipticity [-]", "orientation [degrees]")
+    heads = [f"{when} {head}" for when in ("reference", "deformed") for head in own]
+    kinds = {"holes": matched.holes} | ({"dots": dots} if (dots := matched.seen.dots) else {})
+    paths = tuple(folder / f"{name}_{kind}.csv" for kind in kinds)
+    for path, pairs in zip(paths, kinds.values(), strict=True):
+        shapes = ([HoleShape.of(hole) for hole in pair] for pair in pairs)
+        write_csv(path, heads, ([f"{v:.6g}" for s in two for v in astuple(s)] for two in shapes))
+    return paths

@@ -329,9 +329,9 @@ class MeasureRun(StagedRun[MeasureCase]):
             from modeharvest.report.measure import measure_report
             from modeharvest.report.model import write_page
 
-            if gauges:
-                read = write_gauges(self.folder, gauges, self._with_roots(), self.case.unit)
-            summary["gauges"] = reading_rows(read) if gauges else []
+            summary["gauges"] = [] if not gauges else reading_rows(
+                write_gauges(self.folder, gauges, self._with_roots(), self.case.unit)
+            )  # fmt: skip
             report = measure_report(summary, results, self.residual, self.picture, gauges)
             write_page(report, self.folder / "report.html", self.progress)
             write_json(self.folder / "summary.json", summary)
