@@ -80,11 +80,11 @@ class Structure:
         self.shown, self._quadratic, self._sampled = mesh, self._forms.V, None
         if degree > 2:
             self._quadratic = dolfinx.fem.functionspace(self._forms.V.mesh, ("Lagrange", 2, (2,)))
-            self._sampled = self._forms.sampled(_QUARTERS)
             x = np.einsum("pa,mai->mpi", _AT_QUARTERS, mesh.nodes[mesh.cells]).reshape(-1, 2)
             cells = np.arange(len(x)).reshape(-1, 6)
             self.shown = join([MeshBlock(x, cells)], 1e-8 * float(np.ptp(x[:, 0])))
             self._once = np.unique(self.shown.cells, return_index=True)[1]
+            self._sampled = self._forms.sampled(_QUARTERS)[self._once]
         self.constants = self._forms.constants
         self.V, self._u = self._forms.V, self._forms.u
         self._direction, self._along = (dolfinx.fem.Function(self.V) for _ in range(2))
@@ -182,9 +182,9 @@ class Structure:
 
     def nodal(self, u: PETSc.Vec) -> FloatArray:
         """(n, 2) displacement at the nodes of ``shown``, in their order [mm]; on every rank."""
-        self._load(u)
         if self._sampled is not None:
-            return np.asarray(self._sampled().reshape(-1, 2)[self._once])
+            return np.asarray(self._sampled @ u.array.reshape(-1, 2))
+        self._load(u)
         count = self.comm.bcast(len(self.mesh.nodes))
         return dolfinx_api.gather_nodes(self.V, self._u.x.array, count)
 

@@ -77,10 +77,11 @@ class ParametricState:
 
 
 class _Known(NamedTuple):
-    """A state that was found, and its derivatives by the unknowns; () if they weren't wanted."""
+    """A state found, its internal forces, and its derivatives by the unknowns if wanted."""
 
     state: State
     branch: str
+    forces: PETSc.Vec
     by: Sequence[Sensitivity] = ()
 
 
@@ -156,8 +157,10 @@ class ParametricTest:
             weights, factor = None if amplitudes[k] is None else self._weights, None
             if late.nodes.any() or late.edges.any():
                 state, factor = self._bent(state, first, late, weights), self._factor
-            by = self._by(state, k, travel, weights, factor) if with_derivatives else ()
-            known.append(_Known(state, branch, by))
+            forces, by = self.structure.forces(state.u), list[Sensitivity]()
+            if with_derivatives:
+                by = self._by(state, k, travel, forces, weights, factor)
+            known.append(_Known(state, branch, forces, by))
         return self._results(values, known)
 
     def near(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
@@ -191,8 +194,10 @@ class ParametricTest:
             if is_far or (before.branch != "primary" and amplitude is None and is_lost):
                 return self.at(values, with_derivatives)
             weights = None if amplitude is None else self._weights
-            by = self._by(state, k, travel, weights, self._factor) if with_derivatives else ()
-            known.append(_Known(state, before.branch, by))
+            forces, by = self.structure.forces(state.u), list[Sensitivity]()
+            if with_derivatives:
+                by = self._by(state, k, travel, forces, weights, self._factor)
+            known.append(_Known(state, before.branch, forces, by))
         if self.with_critical:  # always by the whole primary path, which is exactly symmetric
             self._vary(first)
             most = _BEYOND * travel * max(self.experiment.strains)
@@ -213,8 +218,9 @@ class ParametricTest:
         factor = self.structure.factor(_BELOW * point.u)  # at it the tangent is singular
         tangent = path_tangent(self.structure, factor, self.structure.load(point.u))
         state = State(point.strain, point.u, tangent, 0)
-        by = self._by(state, -1, travel, None, factor, point.modes[0])
-        found = self._result(state, "critical", by, travel)
+        forces = self.structure.forces(state.u)
+        by = self._by(state, -1, travel, forces, None, factor, point.modes[0])
+        found = self._result(_Known(state, "critical", forces, by), travel)
         late = np.array([not self._parameters[name].is_symmetric for name in self.names])
         return replace(found, strain=found.strain + float(found.strain_by @ (late * values)))
 
@@ -223,7 +229,7 @@ class ParametricTest:
         self._last = np.array(values), known
         _, late, travel, _ = found = self._given(values)
         self._vary(found[0], 1.0, late)
-        states = [self._result(*one, travel) for one in known]
+        states = [self._result(one, travel) for one in known]
         critical = self.critical_state(values) if self.with_critical else None
         return [*states, critical] if critical else states
 
@@ -419,14 +425,14 @@ class ParametricTest:
         return state
 
     def _by(
-        self, state: State, number: int, travel: float, weights: PETSc.Vec | None,
-        factor: BodyFactor | None, mode: Mode | None = None,
+        self, state: State, number: int, travel: float, forces: PETSc.Vec,
+        weights: PETSc.Vec | None, factor: BodyFactor | None, mode: Mode | None = None,
     ) -> list[Sensitivity]:  # fmt: skip
         """Derivatives by all unknowns: zero by amplitudes of other states."""
         structure, length = self.structure, self.experiment.specimen.length
         own = [n for n in self.names if not n.startswith("amplitude")]
         variations = [None if n == TRAVEL else self._variations[n] for n in own]
-        how = length, weights, travel, factor, mode
+        how = length, weights, travel, factor, mode, forces
         parts = sensitivities(structure, state, variations, *how)
         known: dict[str, Any] = dict(zip(own, parts, strict=True))
         if weights is not None:
@@ -435,9 +441,8 @@ class ParametricTest:
         nothing = Sensitivity(structure.zero(), 0.0, 0.0)
         return [known.get(name, nothing) for name in self.names]
 
-    def _result(
-        self, state: State, branch: str, by: Sequence[Sensitivity], travel: float
-    ) -> ParametricState:
+    def _result(self, known: _Known, travel: float) -> ParametricState:
+        state, branch, forces, by = known
         structure, length, mesh = self.structure, self.experiment.specimen.length, self.mesh
         if np.any(structure.nodes != self._nodes):
             mesh = replace(mesh, nodes=structure.on_shown(structure.nodes))
@@ -447,7 +452,7 @@ class ParametricTest:
         of_travel = np.array([name == TRAVEL for name in names], np.float64)
         strain, strain_by = state.strain / travel, np.array([s.strain for s in by])
         return ParametricState(
-            strain, mesh, structure.nodal(state.u), structure.reaction(state.u, length),
+            strain, mesh, structure.nodal(state.u), structure.reaction_of(forces, length),
             state.negative_pivots, branch, np.reshape(fields, shape), np.reshape(moved, shape),
             np.array([s.force for s in by]), np.asarray((strain_by - strain * of_travel) / travel),
             float(self._weights.dot(state.u)),

@@ -60,7 +60,7 @@ class Sensitivity:
 def sensitivities(
     structure: Structure, state: State, variations: Sequence[Variation | None], length: float,
     weights: PETSc.Vec | None = None, travel: float = 1.0, factor: BodyFactor | None = None,
-    mode: Mode | None = None,
+    mode: Mode | None = None, forces: PETSc.Vec | None = None,
 ) -> list[Sensitivity]:  # fmt: skip
     """Derivatives of an equilibrium by parameters; one factorisation, one block of solutions.
 
@@ -71,13 +71,14 @@ def sensitivities(
     travel : the factor that the state's strain has in it.
     factor : of the tangent stiffness at the state, if it is at hand.
     mode : the critical one of a bifurcation: the strain keeps its curvature zero; see above.
+    forces : internal ones at the state, if they are at hand.
     """
     factor, tangent = factor or structure.factor(state.u), state.tangent
     along = structure.forces_along(state.u, structure.shortening)  # and K is symmetric
-    here = structure.forces(state.u)
+    here = forces or structure.forces(state.u)
     changes = [_change_of_forces(structure, state, v, here) for v in variations if v is not None]
-    forces = [f for f, _ in changes]
-    solutions = zip(changes, _solutions(structure, factor, forces, mode), strict=True)
+    solved = _solutions(structure, factor, [f for f, _ in changes], mode)
+    solutions = zip(changes, solved, strict=True)
     found = list[Sensitivity]()
     softening = 1.0 if mode is None else _curvature_rate(structure, state, mode, tangent, None)
     for variation in variations:
@@ -85,7 +86,7 @@ def sensitivities(
             strain = state.strain / travel if weights is None and mode is None else 0.0
             du, force = strain * tangent, strain * float(along.dot(tangent)) / length
         else:
-            (forces, prescribed), du = next(solutions)
+            (change, prescribed), du = next(solutions)
             strain = 0.0
             if weights is not None:
                 strain = -float(weights.dot(du)) / float(weights.dot(tangent))
@@ -93,7 +94,7 @@ def sensitivities(
                 rate = du + prescribed
                 strain = -_curvature_rate(structure, state, mode, rate, variation) / softening
             du.axpy(strain, tangent)
-            force = structure.reaction_of(forces, length) + float(along.dot(du)) / length
+            force = structure.reaction_of(change, length) + float(along.dot(du)) / length
             du.axpy(1.0, prescribed)
         found.append(Sensitivity(du, force, strain))
     return found
