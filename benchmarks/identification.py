@@ -2,9 +2,11 @@
 
     scripts/env python benchmarks/identification.py edges --seeds 3
     scripts/env python benchmarks/identification.py holes --seeds 1
+    scripts/env python benchmarks/identification.py ovals --seeds 1
 
 The specimen of ``identification_statistics.py``. ``holes``: those of the data are 2 % larger than
 the model's and scattered; they are ignored, all as large as they are on average, or each by itself.
+``ovals``: they are scattered and not round; taken for round, or each with its ovality.
 ``edges``: the loaded edges of the data bow, slide and spread, ignored or unknown. Data, model and
 its finer mesh have meshes of their own.
 """
@@ -32,20 +34,25 @@ from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
 
-SCATTER = Imperfection(0.006, 0.006, seed=1)
-OWN = [f"holes[{k}].{part}" for k in range(len(SPECIMEN.hole_centres)) for part in PARTS]
+SCATTER, HOLES = Imperfection(0.006, 0.006, seed=1, ovality_sd=0.006), len(SPECIMEN.hole_centres)
+OVAL, ROUND = (
+    [f"holes[{k}].{part}" for k in range(HOLES) for part in parts] for parts in (PARTS, PARTS[:3])
+)
 TRUTHS = {
     "holes": {"holes.diameter[0,0]": 0.03,
-              **dict(zip(OWN, SCATTER.drawn(len(OWN) // 3).ravel(), strict=True))},
+              **dict(zip(ROUND, SCATTER.drawn(HOLES)[:, :3].ravel(), strict=True))},
+    "ovals": dict(zip(OVAL, SCATTER.drawn(HOLES).ravel(), strict=True)),
     "edges": {"right.x[2]": 0.1, "right.y[0]": 0.1, "left.y[1]": -0.1},
 }  # fmt: skip
 SETS = {
-    "holes": {"ignored": [], "alike": ["holes.diameter[0,0]"], "each": OWN},
+    "holes": {"ignored": [], "alike": ["holes.diameter[0,0]"], "each": ROUND},
+    "ovals": {"round": ROUND, "oval": OVAL},
     "edges": {"ignored": [], "each": list(TRUTHS["edges"])},
 }
 """True values [mm], and which parameters are unknown."""
 MESHES = {
     "holes": ((0.25, 3), (0.35, 3), (0.35, 4), 0.1),
+    "ovals": ((0.25, 3), (0.35, 3), (0.35, 4), 0.1),
     "edges": ((0.2, 4), (0.35, 3), (0.25, 4), 0.02),
 }
 """Size [mm] and degree of elements of the data, of the model and of its finer mesh, and the ratio
@@ -87,7 +94,7 @@ def by_unknowns(what: str, seeds: int) -> None:
                 coarse, fine = made(*of_model, names), made(*of_finer, names)
                 pixels, noise = MeshPixels(coarse.mesh), ImageNoise(NOISE, NOISE)
                 data = [ImageData(ImagePair(f, g, images.grid), pixels, noise) for g in others]
-                reach = 0.08 if what == "holes" else 0.5
+                reach = 0.5 if what == "edges" else 0.08
                 unknowns = {n: UNKNOWNS.get(n, Unknown(0.0, (-reach, reach))) for n in names}
                 begin = time.process_time()
                 found = identify(
@@ -97,13 +104,12 @@ def by_unknowns(what: str, seeds: int) -> None:
                 )  # fmt: skip
                 seconds = time.process_time() - begin
                 predicted = found.sd_with_model_error
-                if what == "holes":  # x, y and diameter of all, rms
+                if what != "edges":  # of all holes, rms
                     error = holes_of(names, found.values, coarse.experiment) - holes
-                    own = predicted[3:].reshape(-1, 3 if unknown == OWN else 1)
-                    sizes, own_sizes = (
-                        np.sqrt(np.mean(e**2, axis=0)) if e.size else e[0:0, 0]
-                        for e in (error, own)
-                    )
+                    parts = len(unknown) // HOLES
+                    error, own = error[:, :parts], predicted[3:][: parts * HOLES]
+                    own = own.reshape(error.shape)
+                    sizes, own_sizes = (np.sqrt(np.mean(e**2, axis=0)) for e in (error, own))
                 else:
                     error = sizes = found.values[3:] - np.array([truth[n] for n in unknown])
                     own = own_sizes = predicted[3:]

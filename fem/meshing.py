@@ -30,11 +30,12 @@ if TYPE_CHECKING:  # imported where it is needed: a child that meshes starts in 
 def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
     """Move a mesh's holes at random; InputError if 4 standard deviations are half a ligament."""
     half = 0.5 * specimen.ligament_width
-    reach = 4.0 * (imperfection.position_sd + 0.5 * imperfection.diameter_sd)
+    growth_sd = imperfection.diameter_sd + imperfection.ovality_sd
+    reach = 4.0 * (imperfection.position_sd + 0.5 * growth_sd)
     if reach > half:
         raise InputError(
-            f"imperfection: expected 4 (position_sd + diameter_sd / 2) <= {half:.3g} mm, "
-            f"half a ligament, got {reach:.3g} mm; make the scatter smaller"
+            f"imperfection: expected 4 (position_sd + diameter_sd / 2 + ovality_sd / 2) <= "
+            f"{half:.3g} mm, half a ligament, got {reach:.3g} mm; make the scatter smaller"
         )
     if imperfection.is_none:
         return mesh
@@ -43,10 +44,12 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
 
 
 def hole_motion(nodes: FloatArray, specimen: Specimen, holes: FloatArray) -> FloatArray:
-    """(n, 2) motion of nodes (n, 2) for centres and diameters (holes, 3) off the specimen's [mm].
+    """(n, 2) motion of nodes (n, 2) for holes that are off the specimen's (holes, 5) [mm].
 
-    Hole edges stay ellipses of the same aspect; the motion fades out towards the cell's boundary,
-    so cells do not disturb each other and the outer edges stay straight. Linear in ``holes``.
+    By x and y of their centres; by their diameter, which leaves the aspect of an ellipse; by
+    how much they are longer along x and shorter along y; and by the same along the diagonals x = y
+    and x = -y. Edges of holes stay ellipses; the motion fades out towards the cell's boundary, so
+    cells do not disturb each other and the outer edges stay straight. Linear in ``holes``.
     """
     number, scale = specimen.nearest_hole(nodes), np.array([1.0, specimen.aspect])
     radius, outer = 0.5 * specimen.diameters[number], 0.5 * specimen.largest_diameter
@@ -54,8 +57,14 @@ def hole_motion(nodes: FloatArray, specimen: Specimen, holes: FloatArray) -> Flo
     distance = np.linalg.norm(arm, axis=1)
     fade = np.clip((distance - radius) / (outer - radius), 0.0, 1.0)
     weight = np.where(distance < outer, np.cos(0.5 * np.pi * fade) ** 2, 0.0)
-    growth = (0.5 * holes[number, 2] / distance)[:, None] * scale * arm
-    return np.asarray(weight[:, None] * (holes[number, :2] + growth))
+    x, y = arm.T / distance
+    longer, along_x, along_diagonal = 0.5 * holes[number, 2:].T[..., None]
+    growth = (
+        longer * np.column_stack([x, y])
+        + along_x * np.column_stack([x, -y])
+        + along_diagonal * np.column_stack([y, x])
+    )
+    return np.asarray(weight[:, None] * (holes[number, :2] + growth * scale))
 
 
 # Reflecting a T6 element turns it inside out; this reorders its nodes counter-clockwise.

@@ -286,19 +286,24 @@ class Imperfection:
     diameter_sd: float = 0.0
     """Standard deviation of a hole's diameter [mm]."""
     seed: int = 0
+    ovality_sd: float = 0.0
+    """Standard deviation of by how much a hole is longer along x and shorter along y, and likewise
+    along the diagonals [mm]."""
 
     def __post_init__(self) -> None:
-        if not (self.position_sd >= 0 and self.diameter_sd >= 0):
+        if not all(sd >= 0 for sd in (self.position_sd, self.diameter_sd, self.ovality_sd)):
             raise InputError(f"imperfection: expected standard deviations >= 0 mm, got {self}")
         require_within("imperfection: expected a seed", self.seed, 0)
 
     @property
     def is_none(self) -> bool:
         """Whether there is no scatter at all: the specimen keeps its symmetries."""
-        return self.position_sd == 0.0 and self.diameter_sd == 0.0
+        return self.position_sd == self.diameter_sd == self.ovality_sd == 0.0
 
     def drawn(self, count: int) -> FloatArray:
-        """(count, 3) by how much x and y of centres, and diameters, of holes are off [mm]."""
+        """(count, 5) by how much holes are off, see ``fem.meshing.hole_motion`` [mm]."""
         random = np.random.default_rng(self.seed)
         shift = random.normal(0.0, 1.0, (count, 2)) * self.position_sd
-        return np.column_stack([shift, random.normal(0.0, 1.0, count) * self.diameter_sd])
+        growth = random.normal(0.0, 1.0, count) * self.diameter_sd
+        ovality = random.normal(0.0, 1.0, (count, 2)) * self.ovality_sd
+        return np.column_stack([shift, growth, ovality])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -281,6 +282,25 @@ def test_scatter_moves_holes_but_neither_edges_nor_topology() -> None:
         solution, *_ = np.linalg.lstsq(system, square)
         np.testing.assert_allclose(system @ solution, square, rtol=0, atol=1e-12)
         assert 1e-5 < np.linalg.norm(solution[:2]) < 0.05
+
+
+def test_holes_that_are_not_round_are_ellipses() -> None:
+    mesh, scatter = mesh_specimen(SMALL, 0.2), Imperfection(0.005, 0.01, seed=3, ovality_sd=0.03)
+    scattered = perturb(mesh, SMALL, scatter)
+    assert smallest_bernstein(scattered) > 0.0
+    for centre, off in zip(SMALL.hole_centres, scatter.drawn(len(SMALL.hole_centres)), strict=True):
+        hole_edge = np.abs(np.linalg.norm(mesh.nodes - centre, axis=1) - 0.75) < 1e-12
+        x, y, growth, along_x, along_diagonal = off
+        axes = np.array([[along_x, along_diagonal], [along_diagonal, -along_x]])
+        axes += (1.5 + growth) * np.eye(2)
+        arms = (scattered.nodes[hole_edge] - centre - (x, y)) @ np.linalg.inv(0.5 * axes)
+        np.testing.assert_allclose(np.linalg.norm(arms, axis=1), 1.0, rtol=0, atol=1e-12)
+        values, vectors = np.linalg.eigh(axes)
+        longest = np.arctan2(vectors[1, 1], vectors[0, 1])
+        assert np.cos(2.0 * longest - np.arctan2(along_diagonal, along_x)) == pytest.approx(1.0)
+        assert np.ptp(values) == pytest.approx(2.0 * np.hypot(along_x, along_diagonal))
+    without = replace(scatter, ovality_sd=0.0).drawn(len(SMALL.hole_centres))
+    np.testing.assert_array_equal(scatter.drawn(len(without))[:, :3], without[:, :3])
 
 
 def test_no_scatter_leaves_the_mesh_as_it_is() -> None:

@@ -8,7 +8,8 @@ import pytest
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.meshing import hole_motion, mesh_specimen
+from modeharvest.fem.path.parameters import PARTS, parameter
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Imperfection, Specimen
@@ -113,6 +114,21 @@ def test_holes_and_edges_before_and_after_buckling() -> None:
     assert np.abs(state.mesh.nodes - MESH.nodes).max() == pytest.approx(0.015, rel=1e-9)
 
 
+def test_holes_that_are_not_round() -> None:
+    """All alike the specimen keeps its mirrors; smooth in both directions diagonals do, too."""
+    names = ("holes.oval0[0,0]", "holes.oval45[1,1]", "holes[5].oval45")
+    test = made((BEFORE, AFTER), names)
+    values = np.array([0.03, -0.02, 0.01])
+    require_derivatives(test, values)
+    for name, degrees in (("oval0", "[0,0]"), ("oval45", "[1,1]"), ("oval0", "[1,0]")):
+        found = parameter(f"holes.{name}{degrees}", test.experiment)
+        assert found.holes is not None
+        moved = MESH.nodes + 0.05 * hole_motion(MESH.nodes, SMALL, found.holes)
+        rows = {tuple(row) for row in np.round(moved, 9) + 0.0}
+        mirrors = [{tuple(row) for row in np.round(moved * m, 9) + 0.0} for m in ([1, -1], [-1, 1])]
+        assert (mirrors == [rows, rows]) == found.is_symmetric == (degrees != "[1,0]")
+
+
 def test_holes_with_the_amplitude_as_an_unknown() -> None:
     test = made((0.1,), ("holes.diameter[0,0]", "holes[3].x", "amplitude[0]"), FINER)
     require_derivatives(test, np.array([0.02, 0.01, 0.13]))
@@ -120,11 +136,11 @@ def test_holes_with_the_amplitude_as_an_unknown() -> None:
 
 def test_scattered_holes_are_those_of_the_simulation() -> None:
     """Its natural path leads to one of the branches; that of the name is continued to the same."""
-    imperfection = Imperfection(0.006, 0.006, seed=2)
+    imperfection = Imperfection(0.006, 0.006, seed=5, ovality_sd=0.006)
     natural = simulate(
         Experiment(SMALL, strains=(BEFORE, AFTER), mesh_size=0.4, imperfection=imperfection)
     )
-    names = [f"holes[{k}].{part}" for k in range(16) for part in ("x", "y", "diameter")]
+    names = [f"holes[{k}].{part}" for k in range(16) for part in PARTS]
     holes = imperfection.drawn(16)
     test = made((BEFORE, AFTER), tuple(names), FINER)
     for state in test.at(holes.ravel(), with_derivatives=False):

@@ -22,9 +22,11 @@ from modeharvest.util.errors import InputError
 TRAVEL, TILT = "travel", "tilt"
 """Unknowns of the loaded edges: a factor of all nominal strains [-], and the tilt of the edge at
 x > 0 per nominal strain [rad]."""
-PARTS = ("x", "y", "diameter")
-"""Of a hole."""
-_PART, _DEGREE = "(x|y|diameter)", r"(\d+)"
+PARTS = ("x", "y", "diameter", "oval0", "oval45")
+"""Of a hole, in the order of :func:`modeharvest.fem.meshing.hole_motion`."""
+_ODD = {"x": (True, False), "y": (False, True), "oval45": (True, True)}
+"""Whether a part changes its sign in mirrors x -> -x and y -> -y; others don't in either."""
+_PART, _DEGREE = f"({'|'.join(PARTS)})", r"(\d+)"
 _OWN = re.compile(rf"holes\[(\d+)\]\.{_PART}")
 _SMOOTH = re.compile(rf"holes\.{_PART}\[{_DEGREE}, ?{_DEGREE}\]")
 _EDGE = re.compile(rf"(left|right)\.(x|y)\[{_DEGREE}\]")
@@ -61,7 +63,7 @@ class Parameter:
     constant: str = ""
     """Of the material, by its name."""
     holes: FloatArray | None = None
-    """(holes, 3) x and y of the centres, and diameters [mm per unit]."""
+    """(holes, 5) in the order of PARTS [mm per unit]."""
     edge: EdgeMotion | None = None
     is_symmetric: bool = True
     """Whether holes stay mirror images of each other about both axes; of edges, about the x axis,
@@ -73,8 +75,8 @@ def parameter(name: str, experiment: Experiment) -> Parameter:
     """What a name stands for.
 
     "kappa", "moduli[0]" and so on, as the material calls its constants; TRAVEL, TILT;
-    "amplitude[k]", of the pattern in the state number k; "holes.x[i,j]", "holes.y[i,j]" and
-    "holes.diameter[i,j]" of all holes by a polynomial, "holes[k].x" and so on of the hole number k
+    "amplitude[k]", of the pattern in the state number k; "holes.x[i,j]", "holes.diameter[i,j]" and
+    so on, see PARTS, of all holes by a polynomial, "holes[k].x" and so on of the hole number k
     alone, in the order of ``Specimen.hole_centres``; "right.x[j]", "left.y[j]" and so on of the
     loaded edges. InputError if the test has no such parameter.
     """
@@ -89,19 +91,19 @@ def parameter(name: str, experiment: Experiment) -> Parameter:
         _require(name, "a state", int(found[1]), len(experiment.strains))
         return Parameter("mm")
     if found := _OWN.fullmatch(name):
-        number, holes = int(found[1]), np.zeros((len(spec.hole_centres), 3))
+        number, holes = int(found[1]), np.zeros((len(spec.hole_centres), len(PARTS)))
         _require(name, "a hole", number, len(holes))
         holes[number, PARTS.index(found[2])] = 1.0
         return Parameter("mm", holes=holes, is_symmetric=False)
     if found := _SMOOTH.fullmatch(name):
-        degrees, part = (int(found[2]), int(found[3])), PARTS.index(found[1])
+        degrees, part = (int(found[2]), int(found[3])), found[1]
         _require(name, "a degree", max(degrees), _HIGHEST + 1)
         where = (spec.hole_centres / spec.cellular_half_size).T
         along, across = (Legendre.basis(d)(s) for d, s in zip(degrees, where, strict=True))
-        holes = np.zeros((len(along), 3))
-        holes[:, part] = along * across
+        holes = np.zeros((len(along), len(PARTS)))
+        holes[:, PARTS.index(part)] = along * across
         odd = tuple(degree % 2 == 1 for degree in degrees)
-        return Parameter("mm", holes=holes, is_symmetric=odd == (part == 0, part == 1))
+        return Parameter("mm", holes=holes, is_symmetric=odd == _ODD.get(part, (False, False)))
     if found := _EDGE.fullmatch(name):
         axis, degree = "xy".index(found[2]), int(found[3])
         _require(name, "a degree", degree, _HIGHEST + 1)
@@ -113,7 +115,7 @@ def parameter(name: str, experiment: Experiment) -> Parameter:
         motion = EdgeMotion(-1 if found[1] == "left" else 1, axis, degree)
         is_symmetric = spec.holes_y % 2 == 0 and degree % 2 == axis
         return Parameter("mm", edge=motion, is_symmetric=is_symmetric)
-    known += [TRAVEL, TILT, "amplitude[k]", "holes.x[i,j]", "holes.y[i,j]", "holes.diameter[i,j]"]
+    known += [TRAVEL, TILT, "amplitude[k]", *(f"holes.{part}[i,j]" for part in PARTS)]
     known += [f"holes[k].{part}" for part in PARTS]
     known += [f"{side}.{axis}[j]" for side in ("right", "left") for axis in "xy"]
     raise InputError(f"unknowns: expected some of {known}, got {name!r}")
@@ -133,9 +135,9 @@ def _require(name: str, what: str, number: int, count: int) -> None:
 def holes_of(
     names: Sequence[str], values: Sequence[float] | FloatArray, experiment: Experiment
 ) -> FloatArray:
-    """(holes, 3) by how much centres and diameters are off the specimen's, by parameters [mm]."""
+    """(holes, 5) by how much holes are off the specimen's, by parameters [mm]."""
     parts = [parameter(name, experiment).holes for name in names]
-    total = np.zeros((len(experiment.specimen.hole_centres), 3))
+    total = np.zeros((len(experiment.specimen.hole_centres), len(PARTS)))
     for value, part in zip(values, parts, strict=True):
         total = total if part is None else total + value * part
     return total
@@ -143,7 +145,8 @@ def holes_of(
 
 def require_open(specimen: Specimen, holes: FloatArray) -> None:
     """InputError if holes are off by so much that they come near their neighbours'."""
-    moved = np.linalg.norm(holes[:, :2], axis=1) + 0.5 * np.abs(holes[:, 2])
+    growth = np.abs(holes[:, 2]) + np.linalg.norm(holes[:, 3:], axis=1)
+    moved = np.linalg.norm(holes[:, :2], axis=1) + 0.5 * growth
     share = moved / (0.5 * (specimen.largest_diameter - specimen.diameters))
     if share.max() > _OPEN:
         k = int(np.argmax(share))

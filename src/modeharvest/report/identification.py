@@ -144,7 +144,7 @@ def _hole_cards(summary: Summary) -> list[Card]:
     if holes is None:
         return []
     off = np.array([hole["off"] for hole in holes])
-    largest = max(np.abs(off[:, :2]).max(), 0.5 * np.abs(off[:, 2]).max(), 1e-12)
+    largest = max(np.abs(off[:, :2]).max(), 0.5 * np.abs(off[:, 2:]).max(), 1e-12)
     times = float(f"{_HOLES_SHOWN * holes[0]['diameter'] / largest:.1g}")
     figure = ReportFigure("holes", "", partial(_draw_holes, holes, times))
     sd = np.array([hole["off_sd"] for hole in holes])
@@ -160,9 +160,9 @@ def _draw_holes(holes: Sequence[Mapping[str, Any]], times: float) -> Figure:
         for hole in holes:
             if what and hole[what] is None:
                 continue
-            x, y, growth = times * np.array(hole[what]) if what else np.zeros(3)
-            middle = np.add(hole["centre"], (x, y))
-            edge = middle[:, None] + 0.5 * (hole["diameter"] + growth) * circle
+            x, y, growth, oval, slant = times * np.array(hole[what]) if what else np.zeros(5)
+            shape = (hole["diameter"] + growth) * np.eye(2) + [[oval, slant], [slant, -oval]]
+            edge = np.add(hole["centre"], (x, y))[:, None] + 0.5 * shape @ circle
             axes.plot(*edge, style, color=colour, lw=0.8)
     axes.set_aspect("equal")
     return drawn

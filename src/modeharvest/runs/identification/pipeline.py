@@ -20,7 +20,7 @@ import numpy as np
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.fem.path.parameters import holes_of, parameter
+from modeharvest.fem.path.parameters import PARTS, holes_of, parameter
 from modeharvest.idic.finite_element.fields import element_gradients
 from modeharvest.idic.finite_element.identify import (
     LEVELS,
@@ -353,11 +353,11 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             return None, true
         names = [list(found.unknowns)[k] for k in chosen]
         design = np.array([holes_of([name], [1.0], experiment).ravel() for name in names]).T
-        off = (design @ found.values[chosen]).reshape(-1, 3)
+        off = (design @ found.values[chosen]).reshape(-1, len(PARTS))
         covariance = found.covariance_with_model_error[np.ix_(chosen, chosen)]
         own = np.nan_to_num(covariance, posinf=1e6)  # of what nothing determines
         variance = np.einsum("ij,jk,ik->i", design, own, design)
-        sd = np.hypot(np.sqrt(variance), design @ found.mesh_error[chosen]).reshape(-1, 3)
+        sd = np.hypot(np.sqrt(variance), design @ found.mesh_error[chosen]).reshape(off.shape)
         values = {} if twin is None else twin.every(experiment)
         exact = holes_of(list(values), list(values.values()), experiment)
         if twin is not None:
