@@ -25,9 +25,14 @@ from identification_statistics import FORCE_NOISE, NOISE, SPECIMEN, STRAINS, UNK
 from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of
 from modeharvest.fem.specimen import Imperfection
-from modeharvest.idic.finite_element.identify import FinerMesh, Readings, Unknown, identify
-from modeharvest.idic.finite_element.model_error import corrections
-from modeharvest.idic.finite_element.observed import ImageData
+from modeharvest.idic.finite_element.identification.identify import (
+    FinerMesh,
+    Readings,
+    Unknown,
+    identify,
+)
+from modeharvest.idic.finite_element.identification.model_error import corrections
+from modeharvest.idic.finite_element.identification.observed import ImageData
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.imaging.imageset import make_images

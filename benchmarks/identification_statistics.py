@@ -38,7 +38,7 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.fields import element_gradients
-from modeharvest.idic.finite_element.identify import (
+from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
     Model,
@@ -46,9 +46,13 @@ from modeharvest.idic.finite_element.identify import (
     Unknown,
     identify,
 )
+from modeharvest.idic.finite_element.identification.model_error import corrections
+from modeharvest.idic.finite_element.identification.observed import (
+    FieldData,
+    ImageData,
+    StateObservation,
+)
 from modeharvest.idic.finite_element.measure import measure_displacement
-from modeharvest.idic.finite_element.model_error import corrections
-from modeharvest.idic.finite_element.observed import FieldData, ImageData, StateObservation
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.subsets import SubsetOptions, subset_field

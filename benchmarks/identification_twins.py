@@ -41,9 +41,19 @@ from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.specimen import Imperfection
-from modeharvest.idic.finite_element.identify import LEVELS, FinerMesh, Readings, Unknown, identify
-from modeharvest.idic.finite_element.model_error import corrections
-from modeharvest.idic.finite_element.observed import ImageData, at_fixed_points, displacement_at
+from modeharvest.idic.finite_element.identification.identify import (
+    LEVELS,
+    FinerMesh,
+    Readings,
+    Unknown,
+    identify,
+)
+from modeharvest.idic.finite_element.identification.model_error import corrections
+from modeharvest.idic.finite_element.identification.observed import (
+    ImageData,
+    at_fixed_points,
+    displacement_at,
+)
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL

@@ -58,12 +58,8 @@ def hole_motion(nodes: FloatArray, specimen: Specimen, holes: FloatArray) -> Flo
     fade = np.clip((distance - radius) / (outer - radius), 0.0, 1.0)
     weight = np.where(distance < outer, np.cos(0.5 * np.pi * fade) ** 2, 0.0)
     x, y = arm.T / distance
-    longer, along_x, along_diagonal = 0.5 * holes[number, 2:].T[..., None]
-    growth = (
-        longer * np.column_stack([x, y])
-        + along_x * np.column_stack([x, -y])
-        + along_diagonal * np.column_stack([y, x])
-    )
+    d, along_x, slant = 0.5 * holes[number, 2:].T
+    growth = np.column_stack([(d + along_x) * x + slant * y, slant * x + (d - along_x) * y])
     return np.asarray(weight[:, None] * (holes[number, :2] + growth * scale))
 
 

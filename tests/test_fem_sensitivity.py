@@ -13,8 +13,12 @@ from modeharvest.fem.path.parameters import PARTS, parameter
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Imperfection, Specimen
-from modeharvest.idic.finite_element.identify import Readings, Unknown, identify
-from modeharvest.idic.finite_element.observed import FieldData, at_fixed_points, displacement_at
+from modeharvest.idic.finite_element.identification.identify import Readings, Unknown, identify
+from modeharvest.idic.finite_element.identification.observed import (
+    FieldData,
+    at_fixed_points,
+    displacement_at,
+)
 from modeharvest.util.errors import InputError
 
 SMALL = Specimen(4, 4, diameter=1.6, bulk_x=0.9, bulk_y=0.4)

@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 173, 36_595
+MOST_MODULES, MOST_LINES = 171, 35_928
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -33,10 +33,8 @@ OWN_CELLS = (
 )  # fmt: skip
 IDENTIFICATION = (
     "fem/path/sensitivity.py", "fem/path/parametric.py", "fem/path/parameters.py",
-    "fem/path/equilibrium.py",
-    "fem/hyperelastic.py", "idic/finite_element/identify.py",
-    "idic/finite_element/observed.py", "idic/finite_element/model_error.py",
-    "idic/uncertainty/parameters.py",
+    "fem/path/equilibrium.py", "fem/specimen.py", "fem/meshing.py",
+    "fem/hyperelastic.py", "idic/finite_element/identification", "idic/uncertainty/parameters.py",
     "src/modeharvest/runs/identification", "src/modeharvest/report/identification.py",
     "src/modeharvest/cli/identification.py",
 )  # fmt: skip
@@ -80,7 +78,7 @@ FREE_EDGES = (
     "idic/finite_element/cutoff.py",
 )  # fmt: skip
 OWN_BOUNDS = {
-    HOMOGENIZATION: (19, 3_810), OWN_CELLS: (7, 960), IDENTIFICATION: (15, 3_232),
+    HOMOGENIZATION: (19, 3_810), OWN_CELLS: (7, 960), IDENTIFICATION: (19, 4_038),
     DESIGN: (6, 864),
     FIRST_TOUCH: (3, 350),
     CONTOURS: (11, 4_120), SEQUENCES: (10, 2_768), EXPLORE: (2, 300), SHARED_DATA: (3, 450),

@@ -220,6 +220,27 @@ def test_larger_holes_and_a_bowed_edge_are_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.dolfinx
+def test_displacements_of_the_ansatz_beside_the_model(tmp_path: Path) -> None:
+    """What supports did to one state, without a parameter for it; another state has none of it."""
+    true = {"v0[1].x[0,2]": 0.03, "v0[1].y[1,1]": -0.02, "v1[1][0,0]": 0.02}
+    beside = [*true, "v0[0].x[0,2]"]
+    unknowns = {name: {"start": 0.0, "bounds": [-0.2, 0.2]} for name in beside}
+    tables = BEFORE | {"twin": BEFORE["twin"] | {"values": true}}
+    known = tables | {"unknowns": BEFORE["unknowns"] | unknowns}
+    summary = run_identification(known, tmp_path / "known")
+    assert summary["outcome"] == "converged"
+    require_truth(summary)
+    assert [p["true"] for p in summary["parameters"][3:]] == [*true.values(), 0.0]
+    assert {p["unit"] for p in summary["parameters"][3:]} == {"mm"}
+    for p in summary["parameters"][3:]:
+        assert p["sd_with_model_error"] < 1e-3
+    assert summary["model_error"]["p_value"] > 1e-3
+    assert faults(summary, "identify") == []
+    alone = run_identification(tables, tmp_path / "alone")
+    assert alone["states"][1]["residual_rms"] > 1.2 * alone["states"][1]["residual_noise"]
+
+
+@pytest.mark.dolfinx
 def test_the_summary_is_as_its_schema_says(run: tuple[Path, dict[str, Any]]) -> None:
     assert faults(run[1], "identify") == []
 
@@ -377,6 +398,12 @@ def test_the_shipped_case_is_one() -> None:
         ({"finer_mesh_size": 0.6}, "expected finer_mesh_size [mm] above 0 and at most 0.495"),
         ({"unknowns": {"holes[8].x": {"start": 0.0, "bounds": [-0.1, 0.1]}}},
          "expected a hole from 0 to 7 in holes[8].x, got 8"),
+        ({"unknowns": {"v0[2].x[0,0]": {"start": 0.0, "bounds": [-0.1, 0.1]}}},
+         "expected a state from 0 to 1 in v0[2].x[0,0], got 2"),
+        ({"unknowns": {"v1[0][7,0]": {"start": 0.0, "bounds": [-0.1, 0.1]}}},
+         "expected a degree from 0 to 6 in v1[0][7,0], got 7"),
+        ({"unknowns": {"v0[0].z[0,0]": {"start": 0.0, "bounds": [-0.1, 0.1]}}},
+         "'v0[k].x[i,j]'"),
         ({"twin": {"values": {"bow": 0.1}}}, "got 'bow'"),
         ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, "distortion": "lens.json"}},
          "expected images for the distortion of a lens, got fields"),

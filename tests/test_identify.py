@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.identify import (
+from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
     Identified,
@@ -22,9 +22,8 @@ from modeharvest.idic.finite_element.identify import (
     Unknown,
     identify,
 )
-from modeharvest.idic.finite_element.mesh import quadratic
-from modeharvest.idic.finite_element.model_error import corrections, in_words
-from modeharvest.idic.finite_element.observed import (
+from modeharvest.idic.finite_element.identification.model_error import corrections, in_words
+from modeharvest.idic.finite_element.identification.observed import (
     MOTION,
     PLACE,
     FieldData,
@@ -33,6 +32,7 @@ from modeharvest.idic.finite_element.observed import (
     rigidly_moved,
     through_lens,
 )
+from modeharvest.idic.finite_element.mesh import quadratic
 from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.photograph.displacement import alike

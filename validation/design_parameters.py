@@ -3,7 +3,7 @@
 The normal matrix of the parameters p, of which S = du/dp are the model's own sensitivities, is that
 of ``design``, summed over the states that are photographed; a load cell of noise s_F adds
 (dF/dp)' (dF/dp) / s_F² of each. It is what an identification has at its minimum
-(modeharvest.idic.finite_element.identify), without an image.
+(modeharvest.idic.finite_element.identification.identify), without an image.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from modeharvest.idic.finite_element.observed import at_fixed_points
+from modeharvest.idic.finite_element.identification.observed import at_fixed_points
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.util.arrays import FloatArray
 

@@ -71,14 +71,14 @@ class Parameter:
     bifurcation, whose strain answers."""
 
 
-def parameter(name: str, experiment: Experiment) -> Parameter:
+def parameter(name: str, experiment: Experiment, others: Sequence[str] = ()) -> Parameter:
     """What a name stands for.
 
     "kappa", "moduli[0]" and so on, as the material calls its constants; TRAVEL, TILT;
     "amplitude[k]", of the pattern in the state number k; "holes.x[i,j]", "holes.diameter[i,j]" and
     so on, see PARTS, of all holes by a polynomial, "holes[k].x" and so on of the hole number k
     alone, in the order of ``Specimen.hole_centres``; "right.x[j]", "left.y[j]" and so on of the
-    loaded edges. InputError if the test has no such parameter.
+    loaded edges. InputError if the test has no such parameter; ``others`` would do as well.
     """
     spec = experiment.specimen
     if name in (known := list(_constants(experiment))):
@@ -118,7 +118,7 @@ def parameter(name: str, experiment: Experiment) -> Parameter:
     known += [TRAVEL, TILT, "amplitude[k]", *(f"holes.{part}[i,j]" for part in PARTS)]
     known += [f"holes[k].{part}" for part in PARTS]
     known += [f"{side}.{axis}[j]" for side in ("right", "left") for axis in "xy"]
-    raise InputError(f"unknowns: expected some of {known}, got {name!r}")
+    raise InputError(f"unknowns: expected some of {[*known, *others]}, got {name!r}")
 
 
 def _constants(experiment: Experiment) -> Iterator[str]:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from modeharvest.idic.finite_element.identify import Identified
-from modeharvest.idic.finite_element.observed import ImageData, StateObservation
+from modeharvest.idic.finite_element.identification.identify import Identified
+from modeharvest.idic.finite_element.identification.observed import ImageData, StateObservation
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field

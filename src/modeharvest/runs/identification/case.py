@@ -19,7 +19,8 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.fem.path.parameters import PARTS, TILT, TRAVEL, parameter
 from modeharvest.fem.specimen import Imperfection
-from modeharvest.idic.finite_element.identify import Readings, Unknown
+from modeharvest.idic.finite_element.identification.beside_model import NAMES, Term
+from modeharvest.idic.finite_element.identification.identify import Readings, Unknown
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
@@ -113,7 +114,7 @@ class TwinTruth:
     travel: float = 1.0
     tilt: float = 0.0
     values: dict[str, float] = field(default_factory=dict)
-    """Of other parameters, such as "holes.diameter[0,0]" [mm] or "right.x[2]" [mm]."""
+    """Of other unknowns, such as "holes.diameter[0,0]", "right.x[2]" or "v0[0].x[2,0]" [mm]."""
     imperfection: Imperfection = field(default_factory=Imperfection)
     """Scatter of the holes, beside that."""
     force_sd: float = 0.0
@@ -128,8 +129,10 @@ class TwinTruth:
         require_within("twin: expected force_sd [N/mm]", self.force_sd, 0.0)
 
     def every(self, experiment: Experiment) -> dict[str, float]:
-        """Values of parameters of the test by their names, the material's aside."""
-        found = {TRAVEL: self.travel, TILT: self.tilt, **self.values}
+        """Values of parameters of the model by their names, the material's aside."""
+        count = len(experiment.strains)
+        own = {name: v for name, v in self.values.items() if Term.named(name, count) is None}
+        found = {TRAVEL: self.travel, TILT: self.tilt, **own}
         for k, hole in enumerate(self.imperfection.drawn(len(experiment.specimen.hole_centres))):
             for part, off in zip(PARTS, hole, strict=True):
                 if off != 0.0:
@@ -141,7 +144,7 @@ class TwinTruth:
         """Of a parameter by its name, holes aside; None if it has none of that name."""
         if (known := {TRAVEL: self.travel, TILT: self.tilt, **self.values}).get(name) is not None:
             return known[name]
-        if name.startswith(("left.", "right.")):
+        if name.startswith(("left.", "right.", "v0[", "v1[")):
             return 0.0
         base, _, number = name.rstrip("]").partition("[")
         found = getattr(self.material, base, None)
@@ -198,7 +201,8 @@ class IdentificationCase(CaseModel):
         if len(set(names)) < len(names):
             raise InputError(f"laws: expected names that differ, got {names}")
         for name in (*self.unknowns, *(self.twin.values if self.twin is not None else ())):
-            parameter(name, self.experiment)
+            if Term.named(name, len(self.experiment.strains)) is None:
+                parameter(name, self.experiment, NAMES)
         for name in {"kappa", "bulk", "c1", TRAVEL} & self.unknowns.keys():
             require_within(f"unknowns.{name}: expected bounds", self.unknowns[name].bounds[0], 0.0)
         if (self.data is None) == (self.twin is None):

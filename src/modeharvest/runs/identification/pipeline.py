@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,7 +22,8 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of, parameter
 from modeharvest.idic.finite_element.fields import element_gradients
-from modeharvest.idic.finite_element.identify import (
+from modeharvest.idic.finite_element.identification.beside_model import Term, beside
+from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
     Identified,
@@ -30,8 +31,8 @@ from modeharvest.idic.finite_element.identify import (
     Unknown,
     identify,
 )
-from modeharvest.idic.finite_element.model_error import corrections
-from modeharvest.idic.finite_element.observed import (
+from modeharvest.idic.finite_element.identification.model_error import corrections
+from modeharvest.idic.finite_element.identification.observed import (
     MOTION,
     PLACE,
     FieldData,
@@ -146,6 +147,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         model = self._model(true, list(values), _FINE_DEGREE)
         model.with_critical = twin.frame_strain > 0.0
         states = model.at(np.array(list(values.values())), False)
+        terms = _terms(twin.values, true)
+        states = _with_terms(terms, np.array([twin.values[n] for n in terms]), model, states)
         readings = dict[str, Any]()
         if twin.frame_strain:
             low = twin.frame_strain * np.floor(states.pop().strain / twin.frame_strain)
@@ -211,22 +214,25 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         forces: Readings | None, px: float, frame: dict[str, Unknown],
     ) -> tuple[Identified, Any]:  # fmt: skip
         """A case's unknowns, and the camera's, by the data; and the model."""
-        experiment, unknowns = case.experiment, case.unknowns
+        experiment, terms = case.experiment, _terms(case.unknowns, case.experiment)
+        unknowns = {name: unknown for name, unknown in case.unknowns.items() if name not in terms}
         model = self._model(experiment, list(unknowns))
         size = self.case.finer_mesh_size or 0.7 * experiment.mesh_size
         fine = self._model(replace(experiment, mesh_size=size), list(unknowns), _FINE_DEGREE)
         model.with_critical = fine.with_critical = len(data) > len(experiment.strains)
         has_place = any(name in PLACE for name in frame)
+        every = unknowns | {name: case.unknowns[name] for name in terms} | frame
 
         def seen(model: Any, values: FloatArray, with_derivatives: bool) -> list[Any]:
-            own, place, motions = np.split(values, [len(unknowns), len(unknowns) + 3 * has_place])
-            states = model.near(own, with_derivatives)
+            parts = np.cumsum([len(unknowns), len(terms), 3 * has_place])
+            own, added, place, motions = np.split(values, parts)
+            states = _with_terms(terms, added, model, model.near(own, with_derivatives))
             motions = motions.reshape(-1, 3)  # the critical state has no image
             return [imaged(state, place if has_place else None, motions, min(k, len(motions) - 1))
                     for k, state in enumerate(states)]  # fmt: skip
 
         found = identify(
-            lambda values: seen(model, values, True), data, unknowns | frame, pixel_size=px,
+            lambda values: seen(model, values, True), data, every, pixel_size=px,
             forces=forces, levels=(*[Level(4, 3.0)] * (f"{MOTION[0]}[0]" in frame), *LEVELS),
             strains=self._strains,
             finer=FinerMesh(
@@ -238,7 +244,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         )  # fmt: skip
         if not (near := self._beside_critical(found, fine)):
             return found, model
-        wider = case.model_copy(update={"unknowns": unknowns | near})
+        wider = case.model_copy(update={"unknowns": case.unknowns | near})
         other = self._identified(wider, data, forces, px, frame)
         return min((found, model), other, key=lambda pair: pair[0].minimum.equations.cost)
 
@@ -371,8 +377,10 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     def _unit(self, name: str) -> str:
         """Of an unknown."""
-        frame = _FRAME.get(re.split(r"[_[]", name)[0])
-        return parameter(name, self.case.experiment).unit if frame is None else frame[1]
+        if frame := _FRAME.get(re.split(r"[_[]", name)[0]):
+            return frame[1]
+        experiment = self.case.experiment
+        return "mm" if _terms([name], experiment) else parameter(name, experiment).unit
 
     def _critical(self, found: Identified, model: Any) -> dict[str, Any] | None:
         """The critical strain of the model whose states were found last, and what was measured."""
@@ -422,6 +430,23 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "case": case.plain(),
             "versions": versions(*_LIBRARIES),
         }))  # fmt: skip
+
+
+def _terms(names: Iterable[str], experiment: Experiment) -> dict[str, Term]:
+    """Those of some names that are of the ansatz."""
+    named = ((name, Term.named(name, len(experiment.strains))) for name in names)
+    return {name: term for name, term in named if term is not None}
+
+
+def _with_terms(
+    terms: Mapping[str, Term], values: FloatArray, model: Any, states: list[Any]
+) -> list[Any]:
+    """A model's states with displacements of the ansatz beside theirs."""
+    if not terms:
+        return states
+    some = list(terms.values())
+    fields = np.array([term.at(model.mesh.nodes, model.experiment.specimen) for term in some])
+    return [beside(state, k, some, fields, values) for k, state in enumerate(states)]
 
 
 def error_ratio(sizes: float) -> float:

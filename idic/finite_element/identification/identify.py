@@ -15,8 +15,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from modeharvest.idic.finite_element.model_error import ScoreTest, in_words, joint_score
-from modeharvest.idic.finite_element.observed import (
+from modeharvest.idic.finite_element.identification.model_error import (
+    ScoreTest,
+    in_words,
+    joint_score,
+)
+from modeharvest.idic.finite_element.identification.observed import (
     ImageData,
     StateEquations,
     StateObservation,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from modeharvest.idic.finite_element.observed import StateObservation
+from modeharvest.idic.finite_element.identification.observed import StateObservation
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.scaled_eigen import ScaledEigen
 

@@ -1,0 +1,82 @@
+"""Displacements of the ansatz beside a model's, where the model is not trusted.
+
+u = u(p) + v0(X) + v1(X) phi1(X), in each state its own: products of Legendre's polynomials
+P_i(x/a) P_j(y/b) over the specimen, along x, along y, or of its pattern phi1. What supports,
+friction or a flaw of the specimen do to a state without a parameter for it is left to v0 and v1;
+material and forces stay the model's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.polynomial.legendre import Legendre
+
+from modeharvest.fem.specimen import Specimen
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
+    from modeharvest.fem.path.parametric import ParametricState as ModelState
+
+_NAME = re.compile(r"(?:v0\[(\d+)\]\.([xy])|v1\[(\d+)\])\[(\d+), ?(\d+)\]")
+_HIGHEST = 6  # degree of a polynomial
+NAMES = ("v0[k].x[i,j]", "v0[k].y[i,j]", "v1[k][i,j]")
+"""Of terms: along x, along y and along the pattern in the state number k, from 0."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A displacement of the ansatz in one state, per unit of its unknown [mm]."""
+
+    state: int
+    axis: str
+    """"x" or "y" of v0; "" of v1, along the pattern."""
+    degrees: tuple[int, int]
+
+    @classmethod
+    def named(cls, name: str, states: int) -> Term | None:
+        """That of a name as in NAMES; None of another one.
+
+        InputError if there is no such state or too high a degree.
+        """
+        if not (found := _NAME.fullmatch(name)):
+            return None
+        state, degrees = int(found[1] or found[3] or 0), (int(found[4]), int(found[5]))
+        for what, number, count in (("a state", state, states),
+                                    ("a degree", max(degrees), _HIGHEST + 1)):  # fmt: skip
+            if number >= count:
+                raise InputError(
+                    f"unknowns: expected {what} from 0 to {count - 1} in {name}, got {number}"
+                )
+        return cls(state, found[2] or "", degrees)
+
+    def at(self, nodes: FloatArray, specimen: Specimen) -> FloatArray:
+        """(n, 2) displacement at points (n, 2) of the undeformed specimen [mm per mm]."""
+        x, y = (nodes / specimen.half_size).T
+        size = Legendre.basis(self.degrees[0])(x) * Legendre.basis(self.degrees[1])(y)
+        along = np.eye(2)["xy".index(self.axis)] if self.axis else specimen.pattern(nodes)
+        return np.asarray(size[:, None] * along)
+
+
+def beside(
+    state: ModelState, number: int, terms: Sequence[Term], fields: FloatArray, values: FloatArray
+) -> ModelState:
+    """A model's state with the terms of its number; derivatives by all are put behind its own.
+
+    fields : (j, n, 2) of all terms at the mesh's nodes where the specimen has them: they go with
+        nodes that parameters move.
+    values : (j,) of the terms [mm].
+    """
+    own = np.array([term.state == number for term in terms], np.float64)
+    none, nothing = np.zeros(len(terms)), np.zeros_like(fields)
+    return replace(
+        state, displacement=state.displacement + np.tensordot(own * values, fields, 1),
+        displacement_by=np.concatenate([state.displacement_by, own[:, None, None] * fields]),
+        nodes_by=np.concatenate([state.nodes_by, nothing]),
+        force_by=np.append(state.force_by, none), strain_by=np.append(state.strain_by, none),
+    )  # fmt: skip
