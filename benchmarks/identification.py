@@ -7,8 +7,8 @@
 The specimen of ``identification_statistics.py``. ``holes``: those of the data are 2 % larger than
 the model's and scattered; they are ignored, all as large as they are on average, or each by itself.
 ``ovals``: they are scattered and not round; taken for round, or each with its ovality.
-``edges``: the loaded edges of the data bow, slide and spread, ignored or unknown. Data, model and
-its finer mesh have meshes of their own.
+``edges``: the loaded edges of the data bow, slide and spread; they are ignored, unknown, or left to
+displacements of the ansatz beside the model's. Data, model and finer mesh have meshes of their own.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from identification_statistics import FORCE_NOISE, NOISE, SPECIMEN, STRAINS, UNK
 
 from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of
+from modeharvest.fem.path.parametric import ParametricState, ParametricTest
 from modeharvest.fem.specimen import Imperfection
+from modeharvest.idic.finite_element.identification.beside_model import Term, terms_of, with_terms
 from modeharvest.idic.finite_element.identification.identify import (
     FinerMesh,
     Readings,
@@ -38,11 +40,14 @@ from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.util.arrays import FloatArray
 
 SCATTER, HOLES = Imperfection(0.006, 0.006, seed=1, ovality_sd=0.006), len(SPECIMEN.hole_centres)
 OVAL, ROUND = (
     [f"holes[{k}].{part}" for k in range(HOLES) for part in parts] for parts in (PARTS, PARTS[:3])
 )
+LARGEST = 3
+"""Degree of v0 and v1."""
 TRUTHS = {
     "holes": {"holes.diameter[0,0]": 0.03,
               **dict(zip(ROUND, SCATTER.drawn(HOLES)[:, :3].ravel(), strict=True))},
@@ -52,8 +57,16 @@ TRUTHS = {
 SETS = {
     "holes": {"ignored": [], "alike": ["holes.diameter[0,0]"], "each": ROUND},
     "ovals": {"round": ROUND, "oval": OVAL},
-    "edges": {"ignored": [], "each": list(TRUTHS["edges"])},
-}
+    "edges": {
+        "ignored": [],
+        "each": list(TRUTHS["edges"]),
+        "ansatz": [
+            f"{part}[{i},{j}]" for k in range(len(STRAINS))
+            for part in (f"v0[{k}].x", f"v0[{k}].y", f"v1[{k}]")
+            for i in range(LARGEST + 1) for j in range(LARGEST + 1 - i)
+        ],
+    },
+}  # fmt: skip
 """True values [mm], and which parameters are unknown."""
 MESHES = {
     "holes": ((0.25, 3), (0.35, 3), (0.35, 4), 0.1),
@@ -95,16 +108,22 @@ def by_unknowns(what: str, seeds: int) -> None:
             f, *others = (i + rng.normal(0.0, NOISE, i.shape) for i in clear)
             readings = Readings(forces + rng.normal(0.0, sd, len(forces)), sd)
             for name, unknown in SETS[what].items():
+                terms = terms_of(unknown, len(STRAINS))
                 names = ("moduli[0]", "kappa", "tilt", *unknown)
-                coarse, fine = made(*of_model, names), made(*of_finer, names)
+                own = tuple(n for n in names if n not in terms)
+                coarse, fine = made(*of_model, own), made(*of_finer, own)
                 pixels, noise = MeshPixels(coarse.mesh), ImageNoise(NOISE, NOISE)
                 data = [ImageData(ImagePair(f, g, images.grid), pixels, noise) for g in others]
                 reach = 0.5 if what == "edges" else 0.08
                 unknowns = {n: UNKNOWNS.get(n, Unknown(0.0, (-reach, reach))) for n in names}
                 begin = time.process_time()
+                model, finer = (
+                    partial(seen, test, list(terms.values()), is_model)
+                    for test, is_model in ((coarse, True), (fine, False))
+                )
                 found = identify(
-                    coarse.near, data, unknowns, pixel_size=0.03, forces=readings,
-                    finer=FinerMesh(partial(fine.near, with_derivatives=False), ratio),
+                    model, data, unknowns, pixel_size=0.03, forces=readings,
+                    finer=FinerMesh(finer, ratio),
                     corrections=corrections(coarse.mesh.nodes, SPECIMEN.vectors),
                 )  # fmt: skip
                 seconds = time.process_time() - begin
@@ -116,9 +135,10 @@ def by_unknowns(what: str, seeds: int) -> None:
                     own = own.reshape(error.shape)
                     sizes, own_sizes = (np.sqrt(np.mean(e**2, axis=0)) for e in (error, own))
                 else:
-                    error = sizes = found.values[3:] - np.array([truth[n] for n in unknown])
-                    own = own_sizes = predicted[3:]
-                z = error / own if own.shape == error.shape else np.zeros(0)
+                    at = [k for k, n in enumerate(names) if n in TRUTHS["edges"]]
+                    error = sizes = found.values[at] - np.array([truth[names[k]] for k in at])
+                    own = own_sizes = predicted[at]
+                z = error / own
                 test = found.model_error
                 row = [
                     *(f"{found.values[k]:.4g} ± {predicted[k]:.2g}" for k in range(3)),
@@ -129,6 +149,15 @@ def by_unknowns(what: str, seeds: int) -> None:
                     f"{seconds:.0f}",
                 ]  # fmt: skip
                 print("|", seed, "|", name, "|", " | ".join(row), "|", flush=True)
+
+
+def seen(
+    test: ParametricTest, terms: list[Term], with_derivatives: bool, values: FloatArray
+) -> list[ParametricState]:
+    """The model's states, with displacements of the ansatz beside them."""
+    own, added = np.split(values, [len(values) - len(terms)])
+    states = test.near(own, with_derivatives)
+    return with_terms(states, terms, added, test.mesh.nodes, SPECIMEN)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ material and forces stay the model's.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.polynomial.legendre import Legendre
@@ -63,20 +63,33 @@ class Term:
         return np.asarray(size[:, None] * along)
 
 
-def beside(
-    state: ModelState, number: int, terms: Sequence[Term], fields: FloatArray, values: FloatArray
-) -> ModelState:
-    """A model's state with the terms of its number; derivatives by all are put behind its own.
+def terms_of(names: Iterable[str], states: int) -> dict[str, Term]:
+    """The terms among some unknowns, by their names, see :meth:`Term.named`."""
+    named = ((name, Term.named(name, states)) for name in names)
+    return {name: term for name, term in named if term is not None}
 
-    fields : (j, n, 2) of all terms at the mesh's nodes where the specimen has them: they go with
-        nodes that parameters move.
+
+def with_terms(
+    states: list[ModelState], terms: Sequence[Term], values: FloatArray, nodes: FloatArray,
+    specimen: Specimen,
+) -> list[ModelState]:  # fmt: skip
+    """A model's states with terms beside them; derivatives by all are put behind their own.
+
     values : (j,) of the terms [mm].
+    nodes : (n, 2) of the mesh where the specimen has them [mm]: terms go with nodes that parameters
+        move.
     """
-    own = np.array([term.state == number for term in terms], np.float64)
-    none, nothing = np.zeros(len(terms)), np.zeros_like(fields)
-    return replace(
-        state, displacement=state.displacement + np.tensordot(own * values, fields, 1),
-        displacement_by=np.concatenate([state.displacement_by, own[:, None, None] * fields]),
-        nodes_by=np.concatenate([state.nodes_by, nothing]),
-        force_by=np.append(state.force_by, none), strain_by=np.append(state.strain_by, none),
-    )  # fmt: skip
+    if not terms:
+        return states
+    fields = np.array([term.at(nodes, specimen) for term in terms])
+    none, nothing, found = np.zeros(len(terms)), np.zeros_like(fields), list[Any]()
+    for number, state in enumerate(states):
+        own = np.array([term.state == number for term in terms], np.float64)
+        by = own[:, None, None] * fields
+        found.append(replace(
+            state, displacement=state.displacement + np.tensordot(values, by, 1),
+            displacement_by=np.concatenate([state.displacement_by, by]),
+            nodes_by=np.concatenate([state.nodes_by, nothing]),
+            force_by=np.append(state.force_by, none), strain_by=np.append(state.strain_by, none),
+        ))  # fmt: skip
+    return found

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of, parameter
 from modeharvest.idic.finite_element.fields import element_gradients
-from modeharvest.idic.finite_element.identification.beside_model import Term, beside
+from modeharvest.idic.finite_element.identification.beside_model import terms_of, with_terms
 from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
@@ -147,8 +147,9 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         model = self._model(true, list(values), _FINE_DEGREE)
         model.with_critical = twin.frame_strain > 0.0
         states = model.at(np.array(list(values.values())), False)
-        terms = _terms(twin.values, true)
-        states = _with_terms(terms, np.array([twin.values[n] for n in terms]), model, states)
+        terms = terms_of(twin.values, len(true.strains))
+        added, how = np.array([twin.values[n] for n in terms]), (model.mesh.nodes, true.specimen)
+        states = with_terms(states, list(terms.values()), added, *how)
         readings = dict[str, Any]()
         if twin.frame_strain:
             low = twin.frame_strain * np.floor(states.pop().strain / twin.frame_strain)
@@ -214,7 +215,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         forces: Readings | None, px: float, frame: dict[str, Unknown],
     ) -> tuple[Identified, Any]:  # fmt: skip
         """A case's unknowns, and the camera's, by the data; and the model."""
-        experiment, terms = case.experiment, _terms(case.unknowns, case.experiment)
+        experiment = case.experiment
+        terms = terms_of(case.unknowns, len(experiment.strains))
         unknowns = {name: unknown for name, unknown in case.unknowns.items() if name not in terms}
         model = self._model(experiment, list(unknowns))
         size = self.case.finer_mesh_size or 0.7 * experiment.mesh_size
@@ -226,7 +228,9 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         def seen(model: Any, values: FloatArray, with_derivatives: bool) -> list[Any]:
             parts = np.cumsum([len(unknowns), len(terms), 3 * has_place])
             own, added, place, motions = np.split(values, parts)
-            states = _with_terms(terms, added, model, model.near(own, with_derivatives))
+            states = model.near(own, with_derivatives)
+            how = model.mesh.nodes, experiment.specimen
+            states = with_terms(states, list(terms.values()), added, *how)
             motions = motions.reshape(-1, 3)  # the critical state has no image
             return [imaged(state, place if has_place else None, motions, min(k, len(motions) - 1))
                     for k, state in enumerate(states)]  # fmt: skip
@@ -380,7 +384,9 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         if frame := _FRAME.get(re.split(r"[_[]", name)[0]):
             return frame[1]
         experiment = self.case.experiment
-        return "mm" if _terms([name], experiment) else parameter(name, experiment).unit
+        if terms_of([name], len(experiment.strains)):
+            return "mm"
+        return parameter(name, experiment).unit
 
     def _critical(self, found: Identified, model: Any) -> dict[str, Any] | None:
         """The critical strain of the model whose states were found last, and what was measured."""
@@ -430,23 +436,6 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             "case": case.plain(),
             "versions": versions(*_LIBRARIES),
         }))  # fmt: skip
-
-
-def _terms(names: Iterable[str], experiment: Experiment) -> dict[str, Term]:
-    """Those of some names that are of the ansatz."""
-    named = ((name, Term.named(name, len(experiment.strains))) for name in names)
-    return {name: term for name, term in named if term is not None}
-
-
-def _with_terms(
-    terms: Mapping[str, Term], values: FloatArray, model: Any, states: list[Any]
-) -> list[Any]:
-    """A model's states with displacements of the ansatz beside theirs."""
-    if not terms:
-        return states
-    some = list(terms.values())
-    fields = np.array([term.at(model.mesh.nodes, model.experiment.specimen) for term in some])
-    return [beside(state, k, some, fields, values) for k, state in enumerate(states)]
 
 
 def error_ratio(sizes: float) -> float:
