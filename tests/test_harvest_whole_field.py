@@ -315,6 +315,7 @@ def test_it_is_left_out_unless_asked_for(photographs: Path, tmp_path: Path) -> N
         ("mesure = true", "did you mean 'measure'"),
         ("[[gauges]]\nname = 'a'\npoint = [0, 0]", "gauges: expected whole displacements"),
         ("[[gauges]]\nname = 'a'\npoint = [0, 0]\n" * 2, "different names, got 'a' again"),
+        ("measure = true\n[[gauges]]\nname = 'a'\npoint = [99, 0]", "'a': expected it on the mat"),
     ],
 )
 def test_bad_input(
@@ -324,6 +325,7 @@ def test_bad_input(
     path = experiment(photographs, f"[whole_field]\n{line}\n")
     assert called(monkeypatch, "harvest", path, "--out", tmp_path / "out") == 2
     assert message in error_line(capsys)
+    assert not list(tmp_path.rglob("frame*.h5"))  # before anything is measured
 
 
 def test_where_there_is_no_mesh_the_modes_are_harvested_all_the_same(

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from skimage.measure import points_in_poly
 
+from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.fields import field_of, nodal_gradient
-from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.result import NodalResult, located
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -149,12 +150,13 @@ def _stretch(points: FloatArray, F: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(F @ (before / np.linalg.norm(before)), axis=1))
 
 
-def _at(gauge: Gauge, result: NodalResult) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(p, 2) points, (1 + k, p, 2) u and (1 + k, p, 2, 2) F there: the result's, then its roots'.
+def points_of(gauge: Gauge, grid: PixelGrid, mesh: Mesh) -> FloatArray:
+    """(p, 2) points where a gauge reads [mm]; a line's ends are the first and the last one.
 
-    Of a line its ends are the first and the last point.
+    Of an area those on the mesh. InputError if a point or an end is beside the material, or
+    nothing of an area is on it.
     """
-    corners, pixel = gauge.corners(result.grid), result.grid.pixel_size
+    corners, pixel = gauge.corners(grid), grid.pixel_size
     if gauge.line:
         length = float(np.linalg.norm(corners[1] - corners[0]))
         share = np.linspace(0.0, 1.0, max(3, 1 + round(length / (_ALONG_PX * pixel))))
@@ -167,16 +169,22 @@ def _at(gauge: Gauge, result: NodalResult) -> tuple[FloatArray, FloatArray, Floa
         points = points[points_in_poly(points, corners)]  # type: ignore[no-untyped-call]
     else:
         points = corners
-    found = result.at(points, _nodal(result)) if len(points) else np.zeros((0, 2, 3, 1))
-    on: BoolArray = np.asarray(np.isfinite(found).all(axis=(1, 2, 3)))
+    on: BoolArray = located(mesh, points)[0] >= 0
     if gauge.polygon:
-        points, found, on = points[on], found[on], on[on]
+        points, on = points[on], on[on]
     if not (on.any() and on[0] and on[-1]):
-        (left, bottom), (right, top) = np.quantile(result.mesh.nodes, [0, 1], axis=0)
+        (left, bottom), (right, top) = np.quantile(mesh.nodes, [0, 1], axis=0)
         raise InputError(
             f"gauge {gauge.name!r}: expected it on the material, got it beside; the material lies "
             f"in x = {left:.4g} to {right:.4g} and y = {bottom:.4g} to {top:.4g}, y up"
         )
+    return np.asarray(points)
+
+
+def _at(gauge: Gauge, result: NodalResult) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(p, 2) points, (1 + k, p, 2) u and (1 + k, p, 2, 2) F there: the result's and its roots'."""
+    points = points_of(gauge, result.grid, result.mesh)
+    found = result.at(points, _nodal(result))
     F = np.moveaxis(found[..., 1:, :], -1, 0)
     F = np.concatenate([F[:1] + np.eye(2), F[1:]])
     return points, np.moveaxis(found[..., 0, :], -1, 0), F

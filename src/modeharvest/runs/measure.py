@@ -47,7 +47,7 @@ from modeharvest.idic.photograph.displacement import (
     residual,
     speckled,
 )
-from modeharvest.idic.photograph.gauges import read_gauges, reading_rows, write_gauges
+from modeharvest.idic.photograph.gauges import points_of, read_gauges, reading_rows, write_gauges
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain import (
     PlainSurface,
@@ -324,6 +324,8 @@ class MeasureRun(StagedRun[MeasureCase]):
         with exclusive(self.folder):
             require_writable(self.folder)
             gauges = read_gauges(self.case.gauges) if self.case.gauges else ()
+            for gauge in gauges:  # one beside the material is known before anything is measured
+                points_of(gauge, self.grid, self.material.mesh)
             results = self.results()
             summary = self._summary(results)
             from modeharvest.report.measure import measure_report

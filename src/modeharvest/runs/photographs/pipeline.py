@@ -32,7 +32,7 @@ from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field, write_field
-from modeharvest.idic.photograph.gauges import reading_rows, write_gauges
+from modeharvest.idic.photograph.gauges import points_of, reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
     MeasuredPhotograph,
@@ -223,6 +223,8 @@ class HarvestRun(StagedRun[PhotographCase]):
                 "gauges: expected whole displacements, which they read, got none: give "
                 "--whole-field, or set measure = true in [whole_field]"
             )
+        for gauge in self.case.gauges:  # one beside the material is known before anything else
+            points_of(gauge, self.geometry.grid, self._mesh[0].mesh)
 
         def work(
             name: str, last: tuple[str, MeasuredPhotograph] | None
