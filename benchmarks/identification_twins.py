@@ -73,8 +73,8 @@ LAST = 0.1
 """Strain of the second state: with thinner ligaments free edges wrinkle earlier."""
 ROUND = PARTS[:3]
 OWN = tuple(f"holes[{k}].{part}" for k in range(len(SPECIMEN.hole_centres)) for part in ROUND)
-MODEL, FINER, TWIN = 0.35, 0.25, 0.2
-"""Sizes of elements [mm]."""
+MODEL = 0.35
+"""Size of the model's elements [mm]."""
 LENS = CameraDistortion(700.0, 700.0, 170.0, 140.0, k1=0.2, p1=0.01)
 """About 2 px in the corners."""
 SPECKLE = SpeckleSpec(ink=Ink())
@@ -87,6 +87,8 @@ def main() -> None:
     parser.add_argument("--holes", choices=("unknown", "hidden"), default="unknown")
     parser.add_argument("--scatter", type=float, default=0.006, help="of x, y, diameter, sd [mm]")
     parser.add_argument("--pixel-size", type=float, default=0.03, help="[mm/px]")
+    parser.add_argument("--finer-mesh", type=float, default=0.25, help="[mm]")
+    parser.add_argument("--twin-mesh", type=float, default=0.2, help="[mm]")
     parser.add_argument("--plain", action="store_true", help="without lens and ink")
     parser.add_argument("--whole", action="store_true")
     parser.add_argument("--workers", type=int, default=1)
@@ -94,7 +96,7 @@ def main() -> None:
     how = parser.parse_args()
     here = str(Path(__file__).parent)  # where workers find FUNCTION
     os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
-    names = ("holes", "scatter", "pixel_size", "plain", "whole")
+    names = ("holes", "scatter", "pixel_size", "finer_mesh", "twin_mesh", "plain", "whole")
     cases = tuple({**{n: getattr(how, n) for n in names}, "seed": s} for s in range(how.seeds))
     campaign = Campaign(FUNCTION, cases, how.folder.resolve())
     done = campaign.run(Workers(how.workers), lambda d, n, what: print(f"{d}/{n}", end="\r"))
@@ -140,9 +142,9 @@ class Setting:
 
 
 @cache
-def setting(names: tuple[str, ...]) -> Setting:
+def setting(names: tuple[str, ...], finer_mesh: float, twin_mesh: float) -> Setting:
     """Made once in a worker."""
-    sizes = (TWIN, 4, ("tilt", *OWN)), (MODEL, 3, names), (FINER, 4, names)
+    sizes = (twin_mesh, 4, ("tilt", *OWN)), (MODEL, 3, names), (finer_mesh, 4, names)
     twin, model, fine = (made(*size, last=LAST) for size in sizes)
     return Setting(twin, model, fine, MeshPixels(model.mesh))
 
@@ -151,7 +153,8 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """What is identified from a specimen, and how far off that is."""
     seed, is_hidden = case["seed"], case["holes"] == "hidden"
     names = tuple(TRUE) if is_hidden else (*TRUE, *OWN)
-    known, rng = setting(names), np.random.default_rng(seed)
+    known = setting(names, case["finer_mesh"], case["twin_mesh"])
+    rng = np.random.default_rng(seed)
     holes = Imperfection(case["scatter"], case["scatter"], seed=seed).drawn(len(OWN) // 3)[:, :3]
     states = known.twin.at(np.array([TRUE["tilt"], *holes.ravel()]), False)
     forces = np.array([s.force for s in states])
@@ -179,7 +182,7 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     found = identify(
         model, data, unknowns, pixel_size=case["pixel_size"], forces=readings,
         levels=LEVELS if case["whole"] else (FULL,),
-        finer=FinerMesh(finer, error_ratio(FINER / MODEL)),
+        finer=FinerMesh(finer, error_ratio(case["finer_mesh"] / MODEL)),
         corrections=corrections(known.model.mesh.nodes, SPECIMEN.vectors),
     )  # fmt: skip
     assert found.model_error is not None
