@@ -396,9 +396,9 @@ class _Measurement:
         on, body = self._prepare(FULL), self.body
         weight = at.weight(self.cutoff_px * self.pair.grid.pixel_size)
         keep = eroded(on.images.mask, max(1, self.options.edge_px))[on.pixels.row, on.pixels.col]
-        start = np.concatenate([[0], np.cumsum(keep)])[on.pixels.start]
-        pixels = ElementPixels(start, *(part[..., keep] for part in on.pixels[1:]))
-        left = normal_equations(pixels, body.mesh, on.images, at.u.reshape(-1, 2), on.continued)
+        left = normal_equations(
+            on.pixels.only(keep), body.mesh, on.images, at.u.reshape(-1, 2), on.continued
+        )
         share = at.gain * at.signal[:, None, None]
         M = body.matrix(share[..., None] ** 2 * left.blocks)
         others = replace(at, M=M, gradient=body.vector(share * left.gradient), edges=None)

@@ -166,6 +166,12 @@ class ElementPixels(NamedTuple):
     slope: NDArray[Any]
     """(2, p) float32 gradient of f there, along x and y [grey levels/mm]; or (2, 0)."""
 
+    def only(self, keep: BoolArray) -> ElementPixels:
+        """Some of them: (p,) True where they count."""
+        start = np.concatenate([[0], np.cumsum(keep)])[self.start]
+        parts = (part[..., keep] if part.shape[-1] else part for part in self[1:])
+        return ElementPixels(start, *parts)
+
 
 class MeshPixels:
     """Pixels of masks sorted by the elements of a T6 mesh, those of each mask once."""

@@ -31,7 +31,7 @@ from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.elements import shape_functions
 from modeharvest.util.errors import InputError
 
@@ -115,9 +115,8 @@ class ImageData:
 
     def _sort(self, pixels: MeshPixels) -> None:
         """Take the pixels that a mesh covers."""
-        mesh, self.pixels = pixels.mesh, pixels
-        grid = self._given.grid
-        covered = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the model").mask
+        self.pixels = pixels
+        covered = _covered(pixels.mesh, self._given.grid)
         self.pair = replace(self._given, mask=covered & self._given.masks[0])
 
     def prepare(self, level: Level, state: ModelState) -> None:
@@ -131,14 +130,17 @@ class ImageData:
             pair = self._light(pair, mesh, state.displacement)
             light = float(np.std(pair.deformed) / np.std(self.pair.deformed))
         if level == FULL:  # beyond the material that the model shows there, g is continued
-            at = mesh.nodes + state.displacement
-            shown = locate(at, mesh.cells, mesh.element, pair.grid, "deformed mesh").mask
+            shown = _covered(replace(mesh, nodes=mesh.nodes + state.displacement), pair.grid)
             pair = replace(pair, deformed_mask=pair.masks[1] & eroded(shown, 1))
         self._images = images_on(pair, level, _EDGE_PX, order)
         if level == FULL:  # no pixel comes or goes on the way: the cost would jump
             self._images = replace(self._images, valid=None)
         images = self._images
         self._own = self.pixels.on(images.grid, images.mask, images.reference)
+        if level == FULL:  # nor any that shows near or beyond the deformed image's border
+            at, limit = self._in_deformed(state), np.array(images.grid.shape)[:, None] - 1
+            is_inside = (at >= _EDGE_PX) & (at <= limit - _EDGE_PX)
+            self._own = self._own.only(np.all(is_inside, axis=0))
         self._weight, self._gain, self._shared = 1.0, 1.0, 0.0
         if level == FULL:
             self._by_noise(pair, state, light)
@@ -224,15 +226,18 @@ class ImageData:
     def residual(self, state: ModelState) -> FloatArray:
         """(rows, cols) f - g(x + u) [grey levels] of the pixels compared; NaN elsewhere."""
         state = self._shown(state)
-        own, mesh = self._own, self.pixels.mesh
-        found = np.full(self._images.grid.shape, np.nan)
+        own, found = self._own, np.full(self._images.grid.shape, np.nan)
+        g, *_ = self._images.deformed.sample(*self._in_deformed(state))
+        found[own.row, own.col] = own.grey - g
+        return found
+
+    def _in_deformed(self, state: ModelState) -> FloatArray:
+        """(2, p) row and column in the deformed image of the pixels compared [px]."""
+        own, mesh, px = self._own, self.pixels.mesh, self._images.grid.pixel_size
         element = np.repeat(np.arange(len(mesh.cells)), np.diff(own.start))
         N = shape_functions("T6", own.xi.T.astype(np.float64))
         u = np.einsum("pa,pai->pi", N, displacement_at(state, mesh.nodes)[mesh.cells[element]])
-        px = self._images.grid.pixel_size
-        g, *_ = self._images.deformed.sample(own.row - u[:, 1] / px, own.col + u[:, 0] / px)
-        found[own.row, own.col] = own.grey - g
-        return found
+        return np.stack([own.row - u[:, 1] / px, own.col + u[:, 0] / px])
 
 
 class FieldData(StateObservation):
@@ -324,6 +329,16 @@ def rigidly_moved(
     R, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
     shifts = np.broadcast_to(np.eye(2)[:, None], (2, *points.shape))
     return points @ R.T + motion[:2], np.concatenate([by @ R.T, shifts, [points @ slope.T]])
+
+
+def _covered(mesh: Mesh, grid: PixelGrid) -> BoolArray:
+    """(rows, cols) pixels on a mesh, but for those near an edge just beyond the image's border."""
+    w, px = _EDGE_PX, grid.pixel_size
+    wider = PixelGrid(grid.rows + 2 * w, grid.cols + 2 * w, px, grid.x0 - w * px, grid.y0 + w * px)
+    found = locate(mesh.nodes, mesh.cells, mesh.element, wider, "mesh of the model").mask
+    kept, inner = eroded(found, w), (slice(w, -w), slice(w, -w))
+    kept[2 * w : -2 * w, 2 * w : -2 * w] = True
+    return (found & kept)[inner]
 
 
 def through_lens(
