@@ -48,7 +48,7 @@ OVAL, ROUND = (
 )
 LARGEST = 3
 """Degree of v0 and v1."""
-TRUTHS = {
+TRUTHS: dict[str, dict[str, float]] = {
     "holes": {"holes.diameter[0,0]": 0.03,
               **dict(zip(ROUND, SCATTER.drawn(HOLES)[:, :3].ravel(), strict=True))},
     "ovals": dict(zip(OVAL, SCATTER.drawn(HOLES).ravel(), strict=True)),
@@ -110,8 +110,8 @@ def by_unknowns(what: str, seeds: int) -> None:
             for name, unknown in SETS[what].items():
                 terms = terms_of(unknown, len(STRAINS))
                 names = ("moduli[0]", "kappa", "tilt", *unknown)
-                own = tuple(n for n in names if n not in terms)
-                coarse, fine = made(*of_model, own), made(*of_finer, own)
+                of_test = tuple(n for n in names if n not in terms)
+                coarse, fine = made(*of_model, of_test), made(*of_finer, of_test)
                 pixels, noise = MeshPixels(coarse.mesh), ImageNoise(NOISE, NOISE)
                 data = [ImageData(ImagePair(f, g, images.grid), pixels, noise) for g in others]
                 reach = 0.5 if what == "edges" else 0.08

@@ -323,6 +323,27 @@ def test_noise_between_pixels_does_not_bias() -> None:
     assert abs(np.mean(z)) < 3.0 / np.sqrt(len(z))
 
 
+def test_edges_beyond_the_images_border_do_not_count() -> None:
+    """A plate with an edge 1 px out of the reference: in view, or farther out, once it is moved."""
+    grid = replace(GRID, cols=107)
+    x, y = np.meshgrid(grid.x, grid.y)
+    for shift_px in (-9.3, 6.4):
+        shift = shift_px * grid.pixel_size
+        f, g = (
+            np.where((abs(x - s) < 2.0) & (abs(y) < 1.5), pattern(x - s, y), 0.0).astype(np.float32)
+            for s in (0.0, shift)
+        )
+        state = model(0.0 * TRUE)[0]
+        state = replace(state, displacement=state.displacement + np.array([shift, 0.0]))
+        data = ImageData(ImagePair(f, g, grid), MeshPixels(MESH), ImageNoise(NOISE, NOISE))
+        data.prepare(FULL, state)  # type: ignore[arg-type]
+        residual, shown = data.residual(state), np.arange(107) + shift_px  # type: ignore[arg-type]
+        assert np.isnan(residual[:, shown > 104.0]).all()
+        assert np.isfinite(residual[30:60, 20:95]).all()
+        if shift_px < 0.0:
+            assert np.nanmax(abs(residual[:, 90:])) < 2e-3  # 6e-3 beside the edge
+
+
 CORRECTIONS = corrections(MESH.nodes, np.eye(2) * 1.5, degree=1)
 
 
