@@ -124,8 +124,7 @@ class FiniteElementOptions:
 
     def __post_init__(self) -> None:
         what = "finite-element DIC: expected"
-        least = {"element_px": 4.0, "edge_element_px": 4.0, "edge_px": 0, "steps": 1}
-        for name, value in least.items():
+        for name, value in (("element_px", 4), ("edge_element_px", 4), ("edge_px", 0), ("steps", 1)):
             require_within(f"{what} {name}", getattr(self, name), value)
         if self.cutoff_px is not None:
             require_within(f"{what} cutoff_px", self.cutoff_px, 0.0, above=True)
@@ -396,14 +395,12 @@ class _Measurement:
         on, body = self._prepare(FULL), self.body
         weight = at.weight(self.cutoff_px * self.pair.grid.pixel_size)
         keep = eroded(on.images.mask, max(1, self.options.edge_px))[on.pixels.row, on.pixels.col]
-        left = normal_equations(
-            on.pixels.only(keep), body.mesh, on.images, at.u.reshape(-1, 2), on.continued
-        )
+        some, u = on.pixels.only(keep), at.u.reshape(-1, 2)
+        left = normal_equations(some, body.mesh, on.images, u, on.continued)
         share = at.gain * at.signal[:, None, None]
         M = body.matrix(share[..., None] ** 2 * left.blocks)
         others = replace(at, M=M, gradient=body.vector(share * left.gradient), edges=None)
-        change = others.factor(weight).solve(others.right(weight)) + self.by_edges
-        return change.reshape(-1, 2, 1)
+        return (others.factor(weight).solve(others.right(weight)) + self.by_edges).reshape(-1, 2, 1)
 
     def result(self) -> NodalResult:
         """Make the result, with its standard deviations."""

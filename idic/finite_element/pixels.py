@@ -97,8 +97,7 @@ def continued_pixels(pair: ImagePair, noise_f: float, noise_g: float) -> Continu
     ratio = _LARGEST_VARIANCE
     if inside.any():
         found, (rows, cols) = np.empty(g.shape, np.float32), np.nonzero(outermost)
-        of_material = readable(g), readable(inside)
-        in_parallel(_continue, *of_material, readable(rows), readable(cols), found)
+        in_parallel(_continue, *map(readable, (g, inside, rows, cols)), found)
         error = float(np.mean((found[outermost] - g[outermost]) ** 2))
         # The tried pixel has noise itself, and so would have the one that is missing.
         excess, noise = max(0.0, error - 2.0 * noise_g), noise_f + noise_g
@@ -116,8 +115,7 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     distance, nearest = ndimage.distance_transform_edt(~mask, return_indices=True)
     filled = np.ascontiguousarray(image[tuple(nearest)])
     rows, cols = np.nonzero((distance > 0) & (distance <= _REACH_PX))
-    of_material = readable(image), readable(mask)
-    in_parallel(_continue, *of_material, readable(rows), readable(cols), filled)
+    in_parallel(_continue, *map(readable, (image, mask, rows, cols)), filled)
     return filled
 
 
@@ -169,8 +167,7 @@ class ElementPixels(NamedTuple):
     def only(self, keep: BoolArray) -> ElementPixels:
         """Some of them: (p,) True where they count."""
         start = np.concatenate([[0], np.cumsum(keep)])[self.start]
-        parts = (part[..., keep] if part.shape[-1] else part for part in self[1:])
-        return ElementPixels(start, *parts)
+        return ElementPixels(start, *(p[..., keep] if p.shape[-1] else p for p in self[1:]))
 
 
 class MeshPixels:
@@ -190,8 +187,7 @@ class MeshPixels:
         if kept is None or not np.array_equal(kept[0], mask):
             kept = self._kept[key] = mask, self._sorted(grid, mask)
         pixels = kept[1]
-        grey = np.asarray(image, np.float32)[pixels.row, pixels.col]
-        return pixels._replace(grey=grey)
+        return pixels._replace(grey=np.asarray(image, np.float32)[pixels.row, pixels.col])
 
     def _sorted(self, grid: PixelGrid, mask: BoolArray) -> ElementPixels:
         mesh = self.mesh

@@ -116,7 +116,7 @@ class ImageData:
     def _sort(self, pixels: MeshPixels) -> None:
         """Take the pixels that a mesh covers."""
         self.pixels = pixels
-        covered = _covered(pixels.mesh, self._given.grid)
+        covered = _covered(pixels.mesh, self._given.grid, _EDGE_PX)
         self.pair = replace(self._given, mask=covered & self._given.masks[0])
 
     def prepare(self, level: Level, state: ModelState) -> None:
@@ -130,8 +130,9 @@ class ImageData:
             pair = self._light(pair, mesh, state.displacement)
             light = float(np.std(pair.deformed) / np.std(self.pair.deformed))
         if level == FULL:  # beyond the material that the model shows there, g is continued
-            shown = _covered(replace(mesh, nodes=mesh.nodes + state.displacement), pair.grid)
-            pair = replace(pair, deformed_mask=pair.masks[1] & eroded(shown, 1))
+            moved = replace(mesh, nodes=mesh.nodes + state.displacement)
+            shown = eroded(_covered(moved, pair.grid, 1), 1)
+            pair = replace(pair, deformed_mask=pair.masks[1] & shown)
         self._images = images_on(pair, level, _EDGE_PX, order)
         if level == FULL:  # no pixel comes or goes on the way: the cost would jump
             self._images = replace(self._images, valid=None)
@@ -331,9 +332,9 @@ def rigidly_moved(
     return points @ R.T + motion[:2], np.concatenate([by @ R.T, shifts, [points @ slope.T]])
 
 
-def _covered(mesh: Mesh, grid: PixelGrid) -> BoolArray:
-    """(rows, cols) pixels on a mesh, but for those near an edge just beyond the image's border."""
-    w, px = _EDGE_PX, grid.pixel_size
+def _covered(mesh: Mesh, grid: PixelGrid, w: int) -> BoolArray:
+    """(rows, cols) pixels on a mesh, and not within w px of an edge beyond the image's border."""
+    px = grid.pixel_size
     wider = PixelGrid(grid.rows + 2 * w, grid.cols + 2 * w, px, grid.x0 - w * px, grid.y0 + w * px)
     found = locate(mesh.nodes, mesh.cells, mesh.element, wider, "mesh of the model").mask
     kept, inner = eroded(found, w), (slice(w, -w), slice(w, -w))
