@@ -123,11 +123,10 @@ class FiniteElementOptions:
     """Whether to measure with what free edges have in common, without a law: see ``free_edges``."""
 
     def __post_init__(self) -> None:
-        what = "finite-element DIC: expected"
-        for name, value in (("element_px", 4), ("edge_element_px", 4), ("edge_px", 0), ("steps", 1)):
-            require_within(f"{what} {name}", getattr(self, name), value)
+        for name, low in (("element_px", 4), ("edge_element_px", 4), ("edge_px", 0), ("steps", 1)):
+            require_within(f"finite-element DIC: expected {name}", getattr(self, name), low)
         if self.cutoff_px is not None:
-            require_within(f"{what} cutoff_px", self.cutoff_px, 0.0, above=True)
+            require_within("finite-element DIC: expected cutoff_px", self.cutoff_px, 0, above=True)
 
     def body(self, mask: BoolArray, grid: PixelGrid) -> Body:
         """What can be meshed of a mask (rows, cols); InputError as for ``mesh_of_mask``."""
