@@ -245,8 +245,7 @@ def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
     length = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     total, count = float(length.sum()), max(16, int(length.sum()))
     at = np.arange(count) * total / count  # one point a pixel
-    s = np.concatenate([[0.0], np.cumsum(length)])
-    closed = np.vstack([points, points[:1]])
+    s, closed = np.concatenate([[0.0], np.cumsum(length)]), np.vstack([points, points[:1]])
     raw = np.stack([np.interp(at, s, closed[:, k]) for k in (0, 1)], axis=1)
     corners = _corners(raw)
     if not corners.size:

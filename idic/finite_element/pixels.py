@@ -57,8 +57,7 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
         return level_pair(pair, level, edge_px, order)
     inside, mask = pair.masks
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
-    g = continued_spline(pair.deformed, mask, order)
-    inside = eroded(inside, edge_px)
+    g, inside = continued_spline(pair.deformed, mask, order), eroded(inside, edge_px)
     return LevelPair(pair.grid, pair.reference, g, inside, None if valid.all() else valid)
 
 
