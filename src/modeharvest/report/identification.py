@@ -30,6 +30,7 @@ from modeharvest.report.model import (
 
 Summary = Mapping[str, Any]
 _TEST = "{chi_squared:.4g} of {degrees_of_freedom}, p = {p_value:.2g}"
+_PARTS = ("x", "y", "diameter", "ovality along the axes", "ovality along the diagonals")
 _HOLES_SHOWN = 0.15  # of a diameter: as which the largest change of a hole is drawn, about
 
 
@@ -148,7 +149,9 @@ def _hole_cards(summary: Summary) -> list[Card]:
     times = float(f"{_HOLES_SHOWN * holes[0]['diameter'] / largest:.1g}")
     figure = ReportFigure("holes", "", partial(_draw_holes, holes, times))
     sd = np.array([hole["off_sd"] for hole in holes])
-    text = text_of("identified-holes", times=times, sd=1e3 * np.sqrt(np.mean(sd**2, axis=0)))
+    known = zip(1e3 * np.sqrt(np.mean(sd**2, axis=0)), _PARTS, strict=True)
+    words = ", ".join(f"{microns:.1f} µm in {part}" for microns, part in known if microns)
+    text = text_of("identified-holes", times=times, known=words)
     return [Card("Holes as found", [figure], caption=text)]
 
 
