@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import brentq
+from summary_schemas import faults
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import stress_and_tangent
@@ -36,6 +37,7 @@ from modeharvest.runs.photographs.pipeline import harvest
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
+from modeharvest.validation.whole_field import v_percent, waves_percent
 
 SHIPPED = Path(__file__).parents[1] / "src/modeharvest/cases/paper-virtual.h5"
 PLAIN = ImagingSpec(
@@ -257,19 +259,26 @@ def test_a_buckled_specimen_without_speckle(photographed: Path) -> None:
     assert 25 <= np.sum(np.array(flat) < 30.0) <= 35
 
 
-@pytest.mark.parametrize("part", ["plate", "middle"])
-def test_a_part_of_a_specimen_is_measured_away_from_where_it_is_cut(
-    photographed: Path, part: str
-) -> None:
+def cropped(photographed: Path, part: str) -> tuple[FloatImage, FloatImage, FloatArray]:
+    """Reference, deformed picture and true displacement (rows, cols, 2) [mm] of a part."""
     (pair,) = make_images(Solution.read(SHIPPED), PLAIN, photographed, (0.128,))
-    px, (rows, cols) = PLAIN.pixel_size, pair.grid.shape
+    rows, cols = pair.grid.shape
     across = slice(0, int(0.6 * cols)) if part == "plate" else slice(cols // 5, cols - cols // 5)
     along = slice(0, rows) if part == "plate" else slice(rows // 5, rows - rows // 5)
     f, g = (
         read_image(photographed / f"{name}_8bit.tif")[along, across]
         for name in ("reference", "deformed_1280")
     )
-    u, grid = pair.truth.displacement[along, across], PixelGrid.centred(*f.shape, px)
+    return f, g, pair.truth.displacement[along, across]
+
+
+@pytest.mark.parametrize("part", ["plate", "middle"])
+def test_a_part_of_a_specimen_is_measured_away_from_where_it_is_cut(
+    photographed: Path, part: str
+) -> None:
+    f, g, u = cropped(photographed, part)
+    px = PLAIN.pixel_size
+    grid = PixelGrid.centred(*f.shape, px)
     surface = plain_surface(f)
     assert surface is not None
     body = FiniteElementOptions().body(surface.mask, grid)
@@ -411,6 +420,27 @@ def test_harvest_finds_modes_by_contours(
     errors = frame["errors_px"]
     assert 0.0 < errors["noise"]["fluctuation"] < errors["model_error"]["fluctuation"] < 0.1
     assert harvest(experiment, tmp_path / "out")["frames"] == [frame]  # as read from its files
+
+
+def test_modes_of_a_part_in_view(photographed: Path, tmp_path: Path) -> None:
+    """Fitted away from where it is cut, as the truth is there."""
+    *images, u = cropped(photographed, "middle")
+    for name, image in zip("fg", images, strict=True):
+        write_image(tmp_path / f"{name}.tif", np.rint(255 * image).astype(np.uint8))
+    path = tmp_path / "part.toml"
+    path.write_text(
+        '[images]\nreference = "f.tif"\ndeformed = ["g.tif"]\n'
+        "[scale]\npixel_size = 0.04\n[specimen]\ncell_size = 1.9\n"
+    )
+    summary = harvest(path, tmp_path / "out")
+    assert faults(summary, "harvest") == []
+    assert any("Not all of the specimen is in view" in text for text in summary["warnings"])
+    result = Result.read(tmp_path / "out/results/g.json")
+    found = read_result(tmp_path / "out/whole_field/g.h5").displacement_on()
+    inside = np.isfinite(u[..., 0]) & np.isfinite(found[..., 0])
+    best = fit_displacement(u, result.grid, result.ansatz, result.unknowns, inside)
+    assert v_percent(result, best) < 2.0
+    assert waves_percent(result, best) < 0.5
 
 
 def test_a_local_dic_of_a_specimen_without_speckle_is_refused(

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import binary_fill_holes, gaussian_filter, label
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import savgol_filter
 from scipy.spatial import cKDTree
@@ -489,13 +489,19 @@ def _after(
     return found
 
 
-def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
-    """What is farther than so much [mm] from where a picture cuts the material (rows, cols)."""
+def from_cuts(mask: BoolArray) -> FloatArray:
+    """(rows, cols) distance from where the picture's border cuts the material (rows, cols) [px]."""
     border = np.zeros_like(mask)
     border[[0, -1]] = border[:, [0, -1]] = True
-    cut = np.column_stack(found.grid.to_mm(*np.nonzero(mask & border)))
-    mesh = found.mesh
-    far = cKDTree(cut).query(mesh.nodes)[0] > reach
+    return np.asarray(distance_transform_edt(~(mask & border)))
+
+
+def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
+    """What is farther than so much [mm] from where a picture cuts the material (rows, cols)."""
+    mesh, distance = found.mesh, from_cuts(mask) * found.grid.pixel_size
+    at = np.rint(found.grid.to_px(*mesh.nodes.T)).astype(np.int64).T
+    row, col = np.clip(at, 0, np.array(mask.shape) - 1).T
+    far = distance[row, col] > reach
     cells = mesh.cells[far[mesh.cells].all(axis=1)]
     if not cells.size:
         raise InputError(

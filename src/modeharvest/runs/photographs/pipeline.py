@@ -44,6 +44,7 @@ from modeharvest.idic.photograph.measure import (
 )
 from modeharvest.idic.photograph.plain import (
     PlainSurface,
+    from_cuts,
     measure_contours,
     plain_surface,
     write_shapes,
@@ -134,7 +135,10 @@ class HarvestRun(StagedRun[PhotographCase]):
     def geometry(self) -> Geometry:
         """Holes, lattice and cellular part, from the reference."""
         prepared, table = self.prepared, self.case.specimen
-        return find_geometry(prepared.mask(), prepared.grid, table, self.case.base)
+        mask = prepared.mask()
+        if self._plain and self._plain.cut:  # within a cell of there nothing is measured
+            mask &= from_cuts(mask) * prepared.grid.pixel_size > table.cell_size
+        return find_geometry(mask, prepared.grid, table, self.case.base)
 
     def results(self) -> Mapping[str, MeasuredPhotograph]:
         """Correlate every photograph, each after the one before; leaves ``results/``.
@@ -333,7 +337,7 @@ class HarvestRun(StagedRun[PhotographCase]):
     def _mesh(self) -> tuple[Body, FiniteElementOptions]:
         """Of the reference's material, and how to measure on it."""
         how = replace(self.case.whole_field.on_mesh(), edge_px=_EDGE_PX)
-        return how.body(self.geometry.mask, self.geometry.grid), how
+        return how.body(self.prepared.mask(), self.prepared.grid), how
 
     def _with_whole(
         self, name: str, pair: ImagePair, first: MeasuredPhotograph

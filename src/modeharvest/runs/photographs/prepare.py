@@ -333,11 +333,6 @@ def _material(
         return ShownMaterial(mask)
     where = like.mask if like else None
     plain = plain_surface(photograph.image, where)
-    if plain is not None and plain.cut:
-        raise InputError(
-            f"expected all of a specimen without speckle in {photograph.path}, got a part of it; "
-            "take it from farther away, or measure it without modes: modeharvest measure"
-        )
     if plain is not None:
         return ShownMaterial(plain.mask, (_PLAIN,), True, plain.warnings)
     found = find_material(photograph.image, window)
