@@ -26,7 +26,7 @@ from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of
 from modeharvest.fem.path.parametric import ParametricState, ParametricTest
 from modeharvest.fem.specimen import Imperfection
-from modeharvest.idic.finite_element.identification.beside_model import Term, terms_of, with_terms
+from modeharvest.idic.finite_element.identification.ansatz_terms import Term, terms_of, with_terms
 from modeharvest.idic.finite_element.identification.identify import (
     FinerMesh,
     Readings,

@@ -138,9 +138,10 @@ def test_holes_with_the_amplitude_as_an_unknown() -> None:
     require_derivatives(test, np.array([0.02, 0.01, 0.13]))
 
 
-def test_scattered_holes_are_those_of_the_simulation() -> None:
+@pytest.mark.parametrize(("seed", "ovality_sd"), [(2, 0.0), (5, 0.006)])
+def test_scattered_holes_are_those_of_the_simulation(seed: int, ovality_sd: float) -> None:
     """Its natural path leads to one of the branches; that of the name is continued to the same."""
-    imperfection = Imperfection(0.006, 0.006, seed=5, ovality_sd=0.006)
+    imperfection = Imperfection(0.006, 0.006, seed, ovality_sd)
     natural = simulate(
         Experiment(SMALL, strains=(BEFORE, AFTER), mesh_size=0.4, imperfection=imperfection)
     )

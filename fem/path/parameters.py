@@ -31,7 +31,8 @@ _OWN = re.compile(rf"holes\[(\d+)\]\.{_PART}")
 _SMOOTH = re.compile(rf"holes\.{_PART}\[{_DEGREE}, ?{_DEGREE}\]")
 _EDGE = re.compile(rf"(left|right)\.(x|y)\[{_DEGREE}\]")
 _AMPLITUDE = re.compile(r"amplitude\[(\d+)\]")
-_HIGHEST = 6  # degree of a polynomial
+HIGHEST = 6
+"""Degree of a polynomial."""
 _OPEN = 0.5
 """Share of half a ligament that a hole's edge may move: with more the map of the mesh folds."""
 
@@ -88,16 +89,16 @@ def parameter(name: str, experiment: Experiment, others: Sequence[str] = ()) -> 
     if name == TILT:
         return Parameter("rad", edge=EdgeMotion(1, 0, 1, -spec.half_size[1]), is_symmetric=False)
     if found := _AMPLITUDE.fullmatch(name):
-        _require(name, "a state", int(found[1]), len(experiment.strains))
+        require_number(name, "a state", int(found[1]), len(experiment.strains))
         return Parameter("mm")
     if found := _OWN.fullmatch(name):
         number, holes = int(found[1]), np.zeros((len(spec.hole_centres), len(PARTS)))
-        _require(name, "a hole", number, len(holes))
+        require_number(name, "a hole", number, len(holes))
         holes[number, PARTS.index(found[2])] = 1.0
         return Parameter("mm", holes=holes, is_symmetric=False)
     if found := _SMOOTH.fullmatch(name):
         degrees, part = (int(found[2]), int(found[3])), found[1]
-        _require(name, "a degree", max(degrees), _HIGHEST + 1)
+        require_number(name, "a degree", max(degrees), HIGHEST + 1)
         where = (spec.hole_centres / spec.cellular_half_size).T
         along, across = (Legendre.basis(d)(s) for d, s in zip(degrees, where, strict=True))
         holes = np.zeros((len(along), len(PARTS)))
@@ -106,7 +107,7 @@ def parameter(name: str, experiment: Experiment, others: Sequence[str] = ()) -> 
         return Parameter("mm", holes=holes, is_symmetric=odd == _ODD.get(part, (False, False)))
     if found := _EDGE.fullmatch(name):
         axis, degree = "xy".index(found[2]), int(found[3])
-        _require(name, "a degree", degree, _HIGHEST + 1)
+        require_number(name, "a degree", degree, HIGHEST + 1)
         if axis == 1 and experiment.edges != "clamped":
             raise InputError(
                 f"unknowns: expected clamped edges for {name}, got {experiment.edges!r} ones, "
@@ -127,7 +128,8 @@ def _constants(experiment: Experiment) -> Iterator[str]:
         yield from (f"{name}[{k}]" for k in parts) if parts else [name]
 
 
-def _require(name: str, what: str, number: int, count: int) -> None:
+def require_number(name: str, what: str, number: int, count: int) -> None:
+    """InputError unless a number in an unknown's name is from 0 to one less than so many."""
     if number >= count:
         raise InputError(f"unknowns: expected {what} from 0 to {count - 1} in {name}, got {number}")
 

@@ -157,10 +157,7 @@ class ParametricTest:
             weights, factor = None if amplitudes[k] is None else self._weights, None
             if late.nodes.any() or late.edges.any():
                 state, factor = self._bent(state, first, late, weights), self._factor
-            forces, by = self.structure.forces(state.u), list[Sensitivity]()
-            if with_derivatives:
-                by = self._by(state, k, travel, forces, weights, factor)
-            known.append(_Known(state, branch, forces, by))
+            known.append(self._known(state, branch, k, travel, weights, factor, with_derivatives))
         return self._results(values, known)
 
     def near(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
@@ -194,10 +191,8 @@ class ParametricTest:
             if is_far or (before.branch != "primary" and amplitude is None and is_lost):
                 return self.at(values, with_derivatives)
             weights = None if amplitude is None else self._weights
-            forces, by = self.structure.forces(state.u), list[Sensitivity]()
-            if with_derivatives:
-                by = self._by(state, k, travel, forces, weights, self._factor)
-            known.append(_Known(state, before.branch, forces, by))
+            how = k, travel, weights, self._factor, with_derivatives
+            known.append(self._known(state, before.branch, *how))
         if self.with_critical:  # always by the whole primary path, which is exactly symmetric
             self._vary(first)
             most = _BEYOND * travel * max(self.experiment.strains)
@@ -423,6 +418,15 @@ class ParametricTest:
                 continue
             state, reached = found, aim
         return state
+
+    def _known(
+        self, state: State, branch: str, number: int, travel: float, weights: PETSc.Vec | None,
+        factor: BodyFactor | None, with_derivatives: bool,
+    ) -> _Known:  # fmt: skip
+        """What is kept of a state, its internal forces and its derivatives if wanted."""
+        forces = self.structure.forces(state.u)
+        how = number, travel, forces, weights, factor
+        return _Known(state, branch, forces, self._by(state, *how) if with_derivatives else ())
 
     def _by(
         self, state: State, number: int, travel: float, forces: PETSc.Vec,

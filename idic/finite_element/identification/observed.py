@@ -332,9 +332,9 @@ def rigidly_moved(
     return points @ R.T + motion[:2], np.concatenate([by @ R.T, shifts, [points @ slope.T]])
 
 
-def _covered(mesh: Mesh, grid: PixelGrid, w: int) -> BoolArray:
-    """(rows, cols) pixels on a mesh, and not within w px of an edge beyond the image's border."""
-    px = grid.pixel_size
+def _covered(mesh: Mesh, grid: PixelGrid, edge_px: int) -> BoolArray:
+    """(rows, cols) pixels on a mesh, and not so close to an edge beyond the image's border."""
+    w, px = edge_px, grid.pixel_size
     wider = PixelGrid(grid.rows + 2 * w, grid.cols + 2 * w, px, grid.x0 - w * px, grid.y0 + w * px)
     found = locate(mesh.nodes, mesh.cells, mesh.element, wider, "mesh of the model").mask
     kept, inner = eroded(found, w), (slice(w, -w), slice(w, -w))

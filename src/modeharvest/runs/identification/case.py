@@ -19,7 +19,7 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.fem.path.parameters import PARTS, TILT, TRAVEL, parameter
 from modeharvest.fem.specimen import Imperfection
-from modeharvest.idic.finite_element.identification.beside_model import NAMES, Term
+from modeharvest.idic.finite_element.identification.ansatz_terms import NAMES, Term
 from modeharvest.idic.finite_element.identification.identify import Readings, Unknown
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.spec import ImagingSpec

@@ -22,7 +22,7 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of, parameter
 from modeharvest.idic.finite_element.fields import element_gradients
-from modeharvest.idic.finite_element.identification.beside_model import terms_of, with_terms
+from modeharvest.idic.finite_element.identification.ansatz_terms import terms_of, with_terms
 from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
@@ -148,8 +148,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         model.with_critical = twin.frame_strain > 0.0
         states = model.at(np.array(list(values.values())), False)
         terms = terms_of(twin.values, len(true.strains))
-        added, how = np.array([twin.values[n] for n in terms]), (model.mesh.nodes, true.specimen)
-        states = with_terms(states, list(terms.values()), added, *how)
+        added = np.array([twin.values[name] for name in terms])
+        states = with_terms(states, terms.values(), added, model.mesh.nodes, true.specimen)
         readings = dict[str, Any]()
         if twin.frame_strain:
             low = twin.frame_strain * np.floor(states.pop().strain / twin.frame_strain)
@@ -228,9 +228,8 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         def seen(model: Any, values: FloatArray, with_derivatives: bool) -> list[Any]:
             parts = np.cumsum([len(unknowns), len(terms), 3 * has_place])
             own, added, place, motions = np.split(values, parts)
-            states = model.near(own, with_derivatives)
-            how = model.mesh.nodes, experiment.specimen
-            states = with_terms(states, list(terms.values()), added, *how)
+            at = model.mesh.nodes, experiment.specimen
+            states = with_terms(model.near(own, with_derivatives), terms.values(), added, *at)
             motions = motions.reshape(-1, 3)  # the critical state has no image
             return [imaged(state, place if has_place else None, motions, min(k, len(motions) - 1))
                     for k, state in enumerate(states)]  # fmt: skip

@@ -137,7 +137,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         prepared, table = self.prepared, self.case.specimen
         mask = prepared.mask()
         if self._plain and self._plain.cut:  # within a cell of there nothing is measured
-            mask &= from_cuts(mask) * prepared.grid.pixel_size > table.cell_size
+            mask = mask & (from_cuts(mask) * prepared.grid.pixel_size > table.cell_size)
         return find_geometry(mask, prepared.grid, table, self.case.base)
 
     def results(self) -> Mapping[str, MeasuredPhotograph]:

@@ -9,22 +9,21 @@ material and forces stay the model's.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.polynomial.legendre import Legendre
 
+from modeharvest.fem.path.parameters import HIGHEST, require_number
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
 
 if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
     from modeharvest.fem.path.parametric import ParametricState as ModelState
 
 _NAME = re.compile(r"(?:v0\[(\d+)\]\.([xy])|v1\[(\d+)\])\[(\d+), ?(\d+)\]")
-_HIGHEST = 6  # degree of a polynomial
 NAMES = ("v0[k].x[i,j]", "v0[k].y[i,j]", "v1[k][i,j]")
 """Of terms: along x, along y and along the pattern in the state number k, from 0."""
 
@@ -47,12 +46,8 @@ class Term:
         if not (found := _NAME.fullmatch(name)):
             return None
         state, degrees = int(found[1] or found[3] or 0), (int(found[4]), int(found[5]))
-        for what, number, count in (("a state", state, states),
-                                    ("a degree", max(degrees), _HIGHEST + 1)):  # fmt: skip
-            if number >= count:
-                raise InputError(
-                    f"unknowns: expected {what} from 0 to {count - 1} in {name}, got {number}"
-                )
+        require_number(name, "a state", state, states)
+        require_number(name, "a degree", max(degrees), HIGHEST + 1)
         return cls(state, found[2] or "", degrees)
 
     def at(self, nodes: FloatArray, specimen: Specimen) -> FloatArray:
@@ -70,7 +65,7 @@ def terms_of(names: Iterable[str], states: int) -> dict[str, Term]:
 
 
 def with_terms(
-    states: list[ModelState], terms: Sequence[Term], values: FloatArray, nodes: FloatArray,
+    states: list[ModelState], terms: Collection[Term], values: FloatArray, nodes: FloatArray,
     specimen: Specimen,
 ) -> list[ModelState]:  # fmt: skip
     """A model's states with terms beside them; derivatives by all are put behind their own.
