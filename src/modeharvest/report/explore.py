@@ -37,7 +37,7 @@ from modeharvest.util.typed import picked
 from modeharvest.validation.scoring.score import Grading, Score
 from modeharvest.validation.truth import lengths
 
-MOST_SAMPLES, LENGTH_STEP = 3_500_000, 1e-3
+MOST_SAMPLES, LENGTH_STEP = 2_700_000, 1e-3
 """Numbers on a page, at most: about a byte each; lengths are quantised to this [px], or to 1/65535
 of their range if that is more."""
 _LEVELS, _COARSE = 65535, 1000  # steps of an array's range: at most, and enough for the eye

@@ -183,7 +183,7 @@ def _rounded(found: re.Match[str]) -> str:
 
 
 class _WebPRenderer(RendererSVG):
-    """Writes SVG with its pixels as WebP: a half (exact) or a third of PNG's size, and sooner."""
+    """Writes SVG with its pixels as WebP: lossless (exact) or a third of the size of PNG."""
 
     exact = False
 
@@ -192,7 +192,7 @@ class _WebPRenderer(RendererSVG):
         assert transform is None, "what is drawn as pixels has no transform left"
         rows, cols = im.shape[:2]
         width, height = 72 * cols / self.image_dpi, 72 * rows / self.image_dpi
-        how = {"lossless": True, "quality": 20} if self.exact else {"quality": QUALITY}
+        how = {"lossless": True, "quality": 50} if self.exact else {"quality": QUALITY}
         packed = io.BytesIO()
         Image.fromarray(np.ascontiguousarray(im)).save(packed, format="webp", method=2, **how)
         place = {"x": x, "y": y + height - self.height, "width": width, "height": height}
