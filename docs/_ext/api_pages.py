@@ -6,10 +6,38 @@ import ast
 from pathlib import Path
 from typing import Any
 
+from docutils.nodes import Element, bullet_list
 from rst import FOLDER, heading, write
 from sphinx.application import Sphinx
+from sphinx.domains.python import PythonDomain
+from sphinx.environment import BuildEnvironment
 
 SOURCE = Path(__file__).resolve().parents[2] / "src" / "modeharvest"
+DEPTH = 3
+"""Of an API page's contents: the package, its modules, their classes and functions."""
+
+
+class IndexedDomain(PythonDomain):
+    """Python's objects, looked up among those of one last name; Sphinx goes through all of them."""
+
+    _count, _by_last_name = -1, dict[str, dict[str, Any]]()
+
+    def find_obj(
+        self, env: BuildEnvironment, modname: str, classname: str, name: str, *how: Any
+    ) -> list[tuple[str, Any]]:
+        """See Sphinx."""
+        every = self.data["objects"]
+        if len(every) != self._count:
+            self._count, self._by_last_name = len(every), {}
+            for whole, entry in every.items():
+                alike = self._by_last_name.setdefault(whole.rpartition(".")[2], {})
+                alike[whole] = entry
+        last = name.removesuffix("()").rpartition(".")[2]
+        self.data["objects"] = self._by_last_name.get(last, {})
+        try:
+            return super().find_obj(env, modname, classname, name, *how)
+        finally:
+            self.data["objects"] = every
 
 
 def packages(folder: Path = SOURCE) -> dict[str, list[str]]:
@@ -53,7 +81,26 @@ def draw(app: Sphinx) -> None:
         write(folder / f"{name}.rst", page + "\n")
 
 
+def shorten_contents(_: Sphinx, env: BuildEnvironment) -> None:
+    """Leave members of classes out of the contents, which every page's sidebar copies."""
+    for name, contents in env.tocs.items():
+        if name.startswith(f"{FOLDER}/api/"):
+            prune(contents, DEPTH)
+
+
+def prune(contents: Element, depth: int) -> None:
+    """Take off what is deeper in nested lists."""
+    for item in contents.children:
+        for part in [part for part in item.children if isinstance(part, bullet_list)]:
+            if depth > 1:
+                prune(part, depth - 1)
+            else:
+                item.remove(part)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Have the pages written before any is read."""
+    app.add_domain(IndexedDomain, override=True)
     app.connect("builder-inited", draw)
+    app.connect("env-updated", shorten_contents)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
