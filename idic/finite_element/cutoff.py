@@ -177,7 +177,7 @@ def deviations(
     taken = share = np.zeros_like(error := interpolation_error(mesh, at.u.reshape(-1, 2)))
     if isinstance(at.prior, Smoothness):  # what a law allows is not known
         lost = factor.solve(at.body.smoothness_samples).reshape(-1, 2, SAMPLES)
-        blank = mean_around(mesh, np.repeat(1.0 - at.signal, 6).reshape(-1, 6))
+        blank = mean_around(mesh, 1.0 - at.signal)
         # The roughness that was found is that of so many unknowns, or the weight is too large.
         grown = float((at.u - at.prior.start) @ at.penalty)
         rough = weight * grown / max(noise**2 * unknowns, _TINY)
@@ -195,7 +195,8 @@ def deviations(
         again = at.factor(more).solve(more * (at.R @ again.ravel())).reshape(-1, 2)
     missing = change + share * (again - change)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
-    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
+    xx_xy_yx_yy = slopes.swapaxes(2, 3).reshape(-1, 4, SAMPLES)
+    spread = xx_xy_yx_yy @ xx_xy_yx_yy.swapaxes(1, 2) / SAMPLES
     sd = Deviations(found, lost, none, error, spread, share * taken)
     return sd.with_bias(mesh, change, _OF_SLOPES)._replace(changes=missing[..., None])
 
@@ -224,5 +225,4 @@ def contradicted(
 
 def smoothed(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     """(n, ...) means of nodal values over the elements around each node."""
-    means = nodal[mesh.cells].mean(axis=1, keepdims=True)
-    return mean_around(mesh, np.repeat(means, mesh.cells.shape[1], axis=1))
+    return mean_around(mesh, nodal[mesh.cells].mean(axis=1))

@@ -12,11 +12,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.elements import nodal_sums, reference_element, shape_gradients
+from modeharvest.util.elements import reference_element, shape_gradients
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import nearest
 
@@ -151,7 +152,7 @@ def deviation_of(
 
 def nodal_gradient(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     """(n, c, 2) gradient of nodal fields (n, c), the mean of the elements around each node."""
-    return mean_around(mesh, element_gradients(mesh, nodal))
+    return np.asarray((_nodal_slopes(mesh) @ nodal).reshape(len(nodal), 2, -1).swapaxes(1, 2))
 
 
 def interpolation_error(mesh: Mesh, nodal: FloatArray) -> FloatArray:
@@ -161,10 +162,9 @@ def interpolation_error(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     elements of sides h: its rms is h/(4 pi) times that of its gradient.
     """
     gradients, areas = element_gradients(mesh, nodal), _slopes(mesh)[1]
-    off = gradients - mean_around(mesh, gradients)[mesh.cells]
+    off = gradients - nodal_gradient(mesh, nodal)[mesh.cells]
     square = (off**2).sum(axis=-1).mean(axis=1) * (4.0 / np.sqrt(3.0) * areas)[:, None]
-    around = mean_around(mesh, np.repeat(square[:, None], mesh.cells.shape[1], axis=1))
-    return np.asarray(np.sqrt(around) / (4.0 * np.pi))
+    return np.asarray(np.sqrt(mean_around(mesh, square)) / (4.0 * np.pi))
 
 
 def element_gradients(mesh: Mesh, nodal: FloatArray) -> FloatArray:
@@ -182,9 +182,20 @@ def _slopes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
     return slopes.reshape(len(F), -1, len(local)), 0.5 * np.linalg.det(F).mean(axis=1)
 
 
+@lru_cache(maxsize=2)
+def _nodal_slopes(mesh: Mesh) -> csr_array:
+    """(2 n, n) that takes nodal values to their slopes along x and y at each node in turn."""
+    slopes, n = _slopes(mesh)[0], len(mesh.nodes)
+    row = (2 * mesh.cells[:, :, None] + np.arange(2)).reshape(*slopes.shape[:2], 1)
+    share = 1.0 / np.bincount(mesh.cells.ravel(), minlength=n)[row // 2]
+    where = [np.broadcast_to(k, slopes.shape).ravel() for k in (row, mesh.cells[:, None])]
+    return csr_array(((share * slopes).ravel(), where), (2 * n, n))
+
+
 def mean_around(mesh: Mesh, values: FloatArray) -> FloatArray:
-    """(n, ...) means over the elements around each node of values (m, k, ...) at theirs."""
-    n = len(mesh.nodes)
-    total = nodal_sums(n, mesh.cells, values.reshape(*mesh.cells.shape, -1))
-    count = np.maximum(np.bincount(mesh.cells.ravel(), minlength=n), 1)
-    return np.asarray((total / count[:, None]).reshape(n, *values.shape[2:]))
+    """(n, ...) means over the elements around each node of values (m, ...) of the elements."""
+    (m, k), n = mesh.cells.shape, len(mesh.nodes)
+    where = mesh.cells.ravel(), np.repeat(np.arange(m), k)
+    around = csr_array((np.ones(m * k), where), (n, m))
+    found = (around @ values.reshape(m, -1)) / np.maximum(np.diff(around.indptr), 1)[:, None]
+    return np.asarray(found.reshape(n, *values.shape[1:]))

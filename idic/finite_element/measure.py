@@ -83,7 +83,7 @@ class _Stage:
     """Binning and blur of the images."""
     cutoff_px: float
     """Wavelength of which the regularisation leaves one half [px]."""
-    tolerance_px: float = 0.05
+    tolerance_px: float = 0.2
     """Of the step that ends it, rms over the nodes [px]."""
 
 

@@ -40,6 +40,7 @@ _LEAST_SINE = 0.2
 _NARROWEST_PX = 3.0
 """Material between two holes that can still be meshed."""
 
+_PIPE, _MESHER = subprocess.PIPE, (sys.executable, "-P", "-m", "modeharvest.fem.meshing")
 _SECONDS, _SECONDS_PER_ELEMENT = 60.0, 2e-3
 """That gmsh may take: many times what it takes where no boundaries cross."""
 _LEAST_ISLAND, _LEAST_HOLE = 4.0, 0.25
@@ -120,21 +121,23 @@ def mesh_of_mask(
             "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
             "mesh"
         )
-    kept, narrowest, changes = meshable(mask, edge_element_px)
-    # Elements longer than a ligament is wide would make chords of its two edges cross.
-    edge = min(edge_element_px, narrowest)
-    if edge < _NARROWEST_PX:
-        raise InputError(
-            f"expected material at least {_NARROWEST_PX:g} px wide between holes, got {edge:.1f} "
-            "px; take images of more pixels, or fill the holes in the mask"
-        )
-    parts = boundaries(kept, edge)
-    if not parts:
-        raise InputError(
-            f"expected a mask with material for elements of {element_px:g} px, got "
-            f"{int(kept.sum())} px of it, in islands smaller than four elements; check the mask"
-        )
-    nodes, cells = _meshed_in_child(parts, element_px, edge, int(kept.sum()))
+    # gmsh is loaded while the boundaries are found.
+    with subprocess.Popen(_MESHER, stdin=_PIPE, stdout=_PIPE, stderr=_PIPE) as child:
+        kept, narrowest, changes = meshable(mask, edge_element_px)
+        # Elements longer than a ligament is wide would make chords of its two edges cross.
+        edge = min(edge_element_px, narrowest)
+        if edge < _NARROWEST_PX:
+            raise InputError(
+                f"expected material at least {_NARROWEST_PX:g} px wide between holes, got "
+                f"{edge:.1f} px; take images of more pixels, or fill the holes in the mask"
+            )
+        parts = boundaries(kept, edge)
+        if not parts:
+            raise InputError(
+                f"expected a mask with material for elements of {element_px:g} px, got "
+                f"{int(kept.sum())} px of it, in islands smaller than four elements; check the mask"
+            )
+        nodes, cells = _meshed(child, parts, element_px, edge, int(kept.sum()))
     x, y = grid.to_mm(-nodes[:, 1], nodes[:, 0])
     over = (_twice_area(nodes, cells) < 0.0)[:, None]
     cells = np.where(over, cells[:, _REVERSED["T6"]], cells)
@@ -150,36 +153,40 @@ def _unfolded(nodes: FloatArray, cells: IntArray) -> FloatArray:
     return straight
 
 
-def _meshed_in_child(
-    parts: tuple[Loops, ...], element_px: float, edge_px: float, area_px: int
-) -> tuple[FloatArray, IntArray]:
+def _meshed(
+    child: subprocess.Popen[bytes], parts: tuple[Loops, ...], element_px: float, edge_px: float,
+    area_px: int,
+) -> tuple[FloatArray, IntArray]:  # fmt: skip
     """Nodes (n, 2) [px] and T6 elements by gmsh in a process apart, which may crash or not end."""
     seconds = _SECONDS + _SECONDS_PER_ELEMENT * area_px / min(element_px, edge_px) ** 2
-    command = [sys.executable, "-P", "-m", "modeharvest.fem.meshing"]
-    given = pickle.dumps((parts, element_px, edge_px))
     try:
-        done = subprocess.run(command, input=given, capture_output=True, timeout=seconds)
-        failed = done.returncode != 0
-        got = (done.stderr.decode(errors="replace").strip().splitlines() or ["a crash"])[-1]
+        found, errors = child.communicate(pickle.dumps((parts, element_px, edge_px)), seconds)
+        failed = child.returncode != 0
+        got = (errors.decode(errors="replace").strip().splitlines() or ["a crash"])[-1]
     except subprocess.TimeoutExpired:
+        child.kill()
         failed, got = True, f"none in {seconds:.0f} s"
     if failed:
         raise InputError(
             f"expected a mesh within the mask's boundaries from gmsh, got {got}; smooth the mask, "
             "fill its narrow holes, or give a mesh"
         )
-    nodes, cells = pickle.loads(done.stdout)
+    nodes, cells = pickle.loads(found)
     return nodes, cells
 
 
 def _narrowest(mask: BoolArray) -> float:
     """Width of the material where it is narrowest between two holes, or a hole and outside [px]."""
     inside = np.pad(mask, 1)
-    distance, nearest = ndimage.distance_transform_edt(inside, return_indices=True)
+    nearest = ndimage.distance_transform_edt(inside, None, False, True)
     hole = ndimage.label(~inside)[0][tuple(nearest)]
-    pairs = ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1]))
-    widths = [(distance[a] + distance[b])[hole[a] != hole[b]] for a, b in pairs]
-    return float(min((w.min() for w in widths if w.size), default=np.inf))
+
+    def width(row: IntArray, col: IntArray) -> FloatArray:
+        return np.asarray(np.hypot(*(nearest[:, row, col] - np.stack([row, col]))))
+
+    (r, c), (s, d) = np.nonzero(hole[1:] != hole[:-1]), np.nonzero(hole[:, 1:] != hole[:, :-1])
+    widths = np.concatenate([width(r, c) + width(r + 1, c), width(s, d) + width(s, d + 1)])
+    return float(widths.min(initial=np.inf))
 
 
 def quadratic(mesh: Mesh) -> Mesh:

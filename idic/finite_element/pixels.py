@@ -111,9 +111,10 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     mask : (rows, cols) True on material; farther than 4 px from it the nearest pixel's value is
         kept.
     """
-    distance, nearest = ndimage.distance_transform_edt(~mask, return_indices=True)
-    filled = np.ascontiguousarray(image[tuple(nearest)])
-    rows, cols = np.nonzero((distance > 0) & (distance <= _REACH_PX))
+    row, col = ndimage.distance_transform_edt(~mask, None, False, True)
+    filled = np.ascontiguousarray(image[row, col])
+    square = (row - np.arange(len(row))[:, None]) ** 2 + (col - np.arange(row.shape[1])) ** 2
+    rows, cols = np.nonzero((square > 0) & (square <= _REACH_PX**2))
     in_parallel(_continue, *map(readable, (image, mask, rows, cols)), filled)
     return filled
 
@@ -122,20 +123,23 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
 def _continue(
     image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any], thread: int, threads: int
 ) -> None:
+    A, b, phi = np.empty((6, 6)), np.empty(6), np.ones(6)  # of A the upper triangle
+    decay = np.exp(-0.5 * (np.arange(_WINDOW_PX + 1) / _SIGMA_PX) ** 2)
     for p in range(thread, rows.size, threads):
         i, j = rows[p], cols[p]
-        A, b, phi = np.zeros((6, 6)), np.zeros(6), np.ones(6)
+        A[:], b[:] = 0.0, 0.0
         for k in range(max(0, i - _WINDOW_PX), min(image.shape[0], i + _WINDOW_PX + 1)):
             for m in range(max(0, j - _WINDOW_PX), min(image.shape[1], j + _WINDOW_PX + 1)):
                 if not mask[k, m]:
                     continue
                 y, x = float(k - i), float(m - j)
                 phi[1], phi[2], phi[3], phi[4], phi[5] = x, y, x * x, x * y, y * y
-                w = np.exp(-0.5 * (x * x + y * y) / _SIGMA_PX**2)
+                w, grey = decay[abs(k - i)] * decay[abs(m - j)], image[k, m]
                 for a in range(6):
-                    b[a] += w * phi[a] * image[k, m]
-                    for c in range(6):
-                        A[a, c] += w * phi[a] * phi[c]
+                    share = w * phi[a]
+                    b[a] += share * grey
+                    for c in range(a, 6):
+                        A[a, c] += share * phi[c]
         for a in range(1, 6):
             A[a, a] += _RIDGE * A[0, 0]
         # A is positive definite: without its last unknowns, eliminated in turn, the first remains.
@@ -143,8 +147,8 @@ def _continue(
             for a in range(c):
                 share = A[a, c] / A[c, c]
                 b[a] -= share * b[c]
-                for d in range(c):
-                    A[a, d] -= share * A[c, d]
+                for d in range(a, c):
+                    A[a, d] -= share * A[d, c]
         out[i, j] = b[0] / A[0, 0]
 
 

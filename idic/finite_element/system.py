@@ -22,6 +22,7 @@ M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the mo
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -77,8 +78,16 @@ class NodalPattern:
 
     def matrix(self, parts: FloatArray) -> csr_array:
         """(2 n, 2 n) of nodal parts xx, xy, yy (3, q), or xx, xy, yx, yy (4, q)."""
-        blocks = np.stack([*parts[:2], *parts[-2:]], axis=1).reshape(-1, 2, 2)
-        return bsr_array((blocks, self.indices, self.indptr)).tocsr()
+        indptr, indices, order = self._of_components
+        data = np.stack([*parts[:2], *parts[-2:]], axis=1).ravel()[order]
+        return csr_array((data, indices, indptr), shape=(indptr.size - 1,) * 2)
+
+    @cached_property
+    def _of_components(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Row pointers, columns, and the order of entries by nodes there."""
+        numbers = np.arange(4 * self.indices.size).reshape(-1, 2, 2)
+        whole = bsr_array((numbers, self.indices, self.indptr)).tocsr()
+        return whole.indptr, whole.indices, whole.data
 
 
 @compiled()
@@ -167,22 +176,19 @@ class Body:
         self.mask, self.changes = mask, changes
         """(rows, cols) True on pixels that count, None for those of any mask; what was left out."""
         roots = SmoothnessRoots.of(mesh)
-        self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, roots.nodes)
-        self.smoothness = roots.matrix(self.pattern)
-        self.smoothness_samples = roots.samples(SAMPLES)
+        with ThreadPoolExecutor(1) as beside:
+            samples = beside.submit(roots.samples, SAMPLES)
+            self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, roots.nodes)
+            self.smoothness = roots.matrix(self.pattern)
+            self.smoothness_samples = samples.result()
         """(2 n, 2 n) R of both components, and (2 n, SAMPLES) random vectors of that covariance."""
-        edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
-        self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
+        edge = np.diff(mesh.nodes[mesh.cells[:, :2]], axis=1)
+        self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=2)))
         """Of waves along x and y, of both components, that compare data and smoothness [mm]."""
         self._waves = np.kron(np.cos(2.0 * np.pi / self.wavelength * mesh.nodes), np.eye(2))
         self._factor: Factor | None = None
         self._factorised: tuple[csr_array, csr_array, float] | None = None
-        self._stored = 0
-
-    @property
-    def library(self) -> str:
-        """What factorises."""
-        return "" if self._factor is None else self._factor.library
+        self._stored, self.library = 0, ""  # entries of what is factorised, and what does it
 
     def matrix(self, blocks: FloatArray) -> csr_array:
         """(2 n, 2 n) of the blocks (m, 3, 6, 6) of the elements."""
@@ -208,6 +214,7 @@ class Body:
             A.sort_indices()
         if self._factor is None or self._stored != A.nnz:
             self._factor, self._stored = factorise(A, block=2), A.nnz
+            self.library = self._factor.library
         else:
             self._factor.update(A)
         self._factorised = M, R, weight
@@ -233,8 +240,7 @@ class Body:
         ridge = 1e-4 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(12)
         moved = np.linalg.solve(own + ridge, pull.reshape(m, 12, 1))[..., 0]
         square = (pull.reshape(m, 12) * moved).sum(axis=1)
-        squares = np.repeat(np.stack([square, free], axis=1)[:, None], 6, axis=1)
-        found, expected = mean_around(self.mesh, squares).T
+        found, expected = mean_around(self.mesh, np.stack([square, free], axis=1)).T
         inflation = np.maximum(found / np.maximum(expected, 1.0), 1.0)
         share = inflation[self.mesh.cells].mean(axis=1)[:, None, None, None]
         return self.random(share * M, SAMPLES), inflation
@@ -269,9 +275,8 @@ class Smoothness:
 
 
 class Imbalance:
-    """The forces of a T6 mesh that nothing balances; smallest in a body that obeys a law.
+    """The forces of a T6 mesh [mm] that nothing balances; smallest in a body that obeys a law.
 
-    mesh : [mm].
     material : of the body, in plane strain.
     loaded : (n,) True at nodes on which unknown forces act.
     """

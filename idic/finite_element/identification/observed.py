@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.fields import determinant, element_gradients, mean_around
+from modeharvest.idic.finite_element.fields import determinant, element_gradients, nodal_gradient
 from modeharvest.idic.finite_element.pixels import (
     MeshPixels,
     NodalEquations,
@@ -363,7 +363,7 @@ def at_fixed_points(state: ModelState) -> ModelState:
     """A state whose derivatives are those of u at points of the material where nodes are now."""
     if not state.nodes_by.any():
         return state
-    slopes = mean_around(state.mesh, element_gradients(state.mesh, state.displacement))
+    slopes = nodal_gradient(state.mesh, state.displacement)
     by = state.displacement_by - np.einsum("nij,knj->kni", slopes, state.nodes_by)
     return replace(state, displacement_by=by, nodes_by=state.nodes_by[:0])
 
