@@ -22,7 +22,7 @@ import meshio
 import numpy as np
 
 from modeharvest.fem.specimen import Specimen
-from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.arrays import FloatArray, FloatImage, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
 from modeharvest.util.typed import made
@@ -182,13 +182,13 @@ class Solution:
             in_space(self.mesh, fields).write(temporary, file_format="vtu")
 
 
-def in_space(mesh: Mesh, fields: Mapping[str, FloatArray]) -> meshio.Mesh:
+def in_space(mesh: Mesh, fields: Mapping[str, FloatArray | FloatImage]) -> meshio.Mesh:
     """A mesh with nodal fields by name, all in three dimensions: VTK knows no plane.
 
     Scalars are (n,), vectors (n, 2), tensors (n, 2, 2), whose nine components become one row.
     """
 
-    def padded(values: FloatArray) -> FloatArray:
+    def padded(values: FloatArray | FloatImage) -> Any:
         spatial = np.pad(values, ((0, 0), *((0, 1),) * (values.ndim - 1)))
         return spatial if values.ndim < 3 else spatial.reshape(len(values), 9)
 

@@ -17,7 +17,14 @@ from plate_with_hole import GRID, plate_pair, quadratic_field
 from summary_schemas import faults
 from test_cli import called, error_line
 
-from modeharvest.idic.finite_element.files import Given, read_result, write_csv, write_result
+from modeharvest.idic.finite_element.files import (
+    Given,
+    field_at,
+    field_names,
+    read_result,
+    write_csv,
+    write_result,
+)
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
@@ -187,10 +194,15 @@ def test_damaged_files_are_refused_in_one_line(result: NodalResult, tmp_path: Pa
 def test_other_files_say_the_same(result: NodalResult, measured: Path, tmp_path: Path) -> None:
     u = result.displacement
     found = meshio.read(measured / "results/b.vtu")
-    np.testing.assert_array_equal(found.point_data["displacement_mm"][:, :2], u)
-    F = found.point_data["F"].reshape(-1, 3, 3)[:, :2, :2]
-    np.testing.assert_allclose(found.point_data["J"], np.linalg.det(F))
-    stretches = found.point_data["stretch_1"], found.point_data["stretch_2"]
+    labels = {"displacement": "displacement_mm", "standard_deviation": "standard_deviation_mm"}
+    assert found.point_data.keys() == {labels.get(name, name) for name in field_names()}
+    for name in field_names():
+        exact = field_at(result, name).astype(np.float32)
+        spatial = found.point_data[labels.get(name, name)].reshape(len(u), *[3] * (exact.ndim - 1))
+        np.testing.assert_array_equal(spatial[(..., *[slice(2)] * (exact.ndim - 1))], exact)
+    F = result.field("F")
+    np.testing.assert_allclose(result.field("J"), np.linalg.det(F))
+    stretches = result.field("stretch_1"), result.field("stretch_2")
     np.testing.assert_allclose(np.stack(stretches, -1), np.linalg.svd(F)[1], rtol=1e-9)
     # A table of the nodes that every reader of a local DIC's field understands.
     np.testing.assert_allclose(read_field(measured / "results/b.csv", GRID).u, u, rtol=1e-8)

@@ -11,6 +11,7 @@ from scipy.sparse import csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import LIBRARIES, factorise
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.pixels import (
     NONE_CONTINUED,
     continued,
@@ -207,6 +208,24 @@ def test_continued_pixels_weigh_by_how_wrong_they_are() -> None:
     assert ratios[2] < 1.0
     whole = ImagePair(pair.reference, pair.deformed, pair.grid)
     assert continued_pixels(whole, 0.0, 0.0) is NONE_CONTINUED
+
+
+@pytest.mark.parametrize("edge_px", [0, 3])
+def test_pixels_amid_the_material_need_not_be_looked_at_one_by_one(edge_px: int) -> None:
+    """Where none around a block is continued or not valid, sums are the same without asking."""
+    pair = plate_pair(quadratic_field, 0.002)
+    body = FiniteElementOptions().body(pair.masks[0], pair.grid)
+    level = images_on(pair, FULL, edge_px, 5)
+    pixels = body.pixels.on(level.grid, level.mask & body.mask, level.reference)
+    found = continued_pixels(pair, 4e-6, 4e-6, level.valid)
+    each = found._replace(above=NONE_CONTINUED.above)
+    for off in (0.0, 5.3):  # px, by which pixels of edges leave the deformed image's material
+        u = quadratic_field(body.mesh.nodes) + off * GRID.pixel_size
+        a, b = (normal_equations(pixels, body.mesh, level, u, by) for by in (found, each))
+        assert (a.outside > 0) == (off > 0.0)
+        for name in ("blocks", "gradient", "squares", "counts", "weights"):
+            one, other = getattr(a, name), getattr(b, name)
+            np.testing.assert_allclose(one, other, atol=1e-10 * abs(other).max())
 
 
 def test_residuals_alike_over_elements_inflate_the_variance(mesh: Mesh) -> None:

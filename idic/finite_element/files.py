@@ -133,13 +133,13 @@ def field_at(
 
 
 def write_vtu(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> None:
-    """Write mesh and fields for ParaView, atomically."""
+    """Write mesh and fields for ParaView, atomically; these in single precision, not compressed."""
     fields = {
-        f"{name}_{given.unit}" if name in _VECTORS else name: field_at(result, name, None, given)
-        for name in field_names(given)
-    }
+        f"{name}_{given.unit}" if name in _VECTORS else name:
+        field_at(result, name, None, given).astype(np.float32) for name in field_names(given)
+    }  # fmt: skip
     with atomic(path) as temporary:
-        in_space(result.mesh, fields).write(temporary, file_format="vtu")
+        in_space(result.mesh, fields).write(temporary, file_format="vtu", compression=None)
 
 
 def components(name: str, values: FloatArray, unit: str) -> dict[str, FloatArray]:

@@ -257,7 +257,7 @@ class _Measurement:
         return replace(
             on, pixels=on.pixels._replace(slope=slope),
             slope_noise=noise * slope_noise(self.order, blur) / px**2,
-            continued=continued_pixels(self.pair, noise, noise_g),
+            continued=continued_pixels(self.pair, noise, noise_g, on.images.valid),
         )  # fmt: skip
 
     def linearised(self) -> Linearised:

@@ -76,17 +76,22 @@ class ContinuedPixels(NamedTuple):
     """(rows, cols) float32, 1 where a pixel is continued and 0 on material; (0, 0) for nowhere."""
     variance: float
     """Of a continued pixel's error, over that of the residual's noise [-]."""
+    above: NDArray[Any]
+    """(rows + 1, cols + 1) int32 how many of them, or not valid, are above and to the left."""
 
 
-NONE_CONTINUED = ContinuedPixels(np.zeros((0, 0), np.float32), 0.0)
+NONE_CONTINUED = ContinuedPixels(np.zeros((0, 0), np.float32), 0.0, np.zeros((0, 0), np.int32))
 _LARGEST_VARIANCE = 1e6
 """Of continued pixels where there is no noise [-]."""
 
 
-def continued_pixels(pair: ImagePair, noise_f: float, noise_g: float) -> ContinuedPixels:
+def continued_pixels(
+    pair: ImagePair, noise_f: float, noise_g: float, valid: BoolArray | None = None
+) -> ContinuedPixels:
     """Estimate the continued pixels' variance from the outermost pixels of the material.
 
-    ``noise_f``, ``noise_g``: variances of the images' noise [grey levels^2].
+    ``noise_f``, ``noise_g``: variances of the images' noise [grey levels^2]; ``valid``: where the
+    deformed image's are (rows, cols), None for everywhere.
     """
     g, mask = pair.deformed, pair.deformed_mask
     if mask is None or mask.all():
@@ -101,7 +106,10 @@ def continued_pixels(pair: ImagePair, noise_f: float, noise_g: float) -> Continu
         # The tried pixel has noise itself, and so would have the one that is missing.
         excess, noise = max(0.0, error - 2.0 * noise_g), noise_f + noise_g
         ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
-    return ContinuedPixels((~mask).astype(np.float32), ratio)
+    lost = ~mask if valid is None else ~(mask & valid)
+    above = np.pad(lost, ((1, 0), (1, 0))).astype(np.int32)
+    np.cumsum(np.cumsum(above, axis=0, out=above), axis=1, out=above)
+    return ContinuedPixels((~mask).astype(np.float32), ratio, above)
 
 
 def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
@@ -300,7 +308,7 @@ def normal_equations(
 @compiled(relaxed=True)
 def accumulate_elements(
     pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, outside: Any,
-    variance: float, pixel_size: float, blocks: Any, gradient: Any, sums: Any,
+    variance: float, above: Any, pixel_size: float, blocks: Any, gradient: Any, sums: Any,
     thread: int, threads: int,
 ) -> None:  # fmt: skip
     """Fill each element's own sums of products over its pixels."""
@@ -311,10 +319,13 @@ def accumulate_elements(
         for begin in range(pixels.start[e], pixels.start[e + 1], _BLOCK):
             n = min(_BLOCK, pixels.start[e + 1] - begin)
             _shapes(pixels.xi, begin, n, N)
-            _sample(pixels, begin, n, N, u[e], coefficients, order, valid, pixel_size, own, sums[e])
+            _map(pixels, begin, n, N, u[e], pixel_size, own)
+            amid = _is_amid(n, above, own)
+            at = valid[:0] if amid else valid
+            _sample(pixels, begin, n, coefficients, order, at, pixel_size, own, sums[e])
             if pixels.slope.size:
                 _push_forward(pixels, begin, n, x[e], u[e], own, sums[e])
-            if outside.size:
+            if outside.size and not amid:
                 _weigh(n, outside, variance, own)
             for m in range(n):
                 sums[e, 0] += own[2, m] * own[2, m]
@@ -335,13 +346,9 @@ def _shapes(xi: Any, begin: int, n: int, N: Any) -> None:
 
 
 @compiled(relaxed=True)
-def _sample(
-    pixels: Any, begin: int, n: int, N: Any, u: Any, coefficients: Any, order: int, valid: Any,
-    pixel_size: float, own: Any, sums: Any,
-) -> None:  # fmt: skip
-    """Fill gradient (2), residual, and weight 1 or 0, of a block; count its pixels."""
-    g_x, g_y, residual, at_row, at_col = own[0], own[1], own[2], own[4], own[5]
-    g, weight, per_px = own[6], own[3], 1.0 / pixel_size
+def _map(pixels: Any, begin: int, n: int, N: Any, u: Any, pixel_size: float, own: Any) -> None:
+    """Fill where a block's pixels are in the deformed image, row and column."""
+    at_row, at_col, per_px = own[4], own[5], 1.0 / pixel_size
     for m in range(n):
         right = up = 0.0
         for a in range(6):
@@ -349,6 +356,29 @@ def _sample(
             up += N[a, m] * u[a, 1]
         at_row[m] = pixels.row[begin + m] - up * per_px
         at_col[m] = pixels.col[begin + m] + right * per_px
+
+
+@compiled(relaxed=True)
+def _is_amid(n: int, above: Any, own: Any) -> bool:
+    """Whether all pixels around a block's are those of the deformed image's material."""
+    if above.size == 0:
+        return False
+    top, left = own[4, :n].min(), own[5, :n].min()
+    bottom, right = own[4, :n].max() + 2.0, own[5, :n].max() + 2.0
+    if top < 0.0 or left < 0.0 or bottom >= above.shape[0] or right >= above.shape[1]:
+        return False
+    i, j, k, m = int(top), int(left), int(bottom), int(right)
+    return bool(above[k, m] - above[i, m] - above[k, j] + above[i, j] == 0)
+
+
+@compiled(relaxed=True)
+def _sample(
+    pixels: Any, begin: int, n: int, coefficients: Any, order: int, valid: Any, pixel_size: float,
+    own: Any, sums: Any,
+) -> None:  # fmt: skip
+    """Fill gradient (2), residual, and weight 1 or 0, of a block; count its pixels."""
+    g_x, g_y, residual, at_row, at_col = own[0], own[1], own[2], own[4], own[5]
+    g, weight, per_px = own[6], own[3], 1.0 / pixel_size
     sample_points(coefficients, order, at_row, at_col, n, g, g_y, g_x)
     for m in range(n):
         counts = not np.isnan(g[m])
