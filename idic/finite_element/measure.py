@@ -60,9 +60,9 @@ _WRONG = 0.075
 because smoothing takes more away at edges than bars know (docs/explanation/whole_field_laws.md)."""
 _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
-_SHORT_PX = 0.1
+_SHORT_PX, _SHORT_AT_A_NODE_PX = 0.1, 0.5
 """After shorter steps the matrices are kept, where only the images make them change and steps get
-shorter; rms over the nodes [px]."""
+shorter; rms over the nodes, and of a single one [px]."""
 _LEAST_DET = 0.1
 """Elements that shrink to less are an iteration gone astray."""
 _UNLIKE, _SEEN = 0.25, 0.25
@@ -83,13 +83,13 @@ class _Stage:
     """Binning and blur of the images."""
     cutoff_px: float
     """Wavelength of which the regularisation leaves one half [px]."""
-    tolerance_px: float = 0.2
-    """Of the step that ends it, rms over the nodes [px]."""
+    tolerance_px: float = 0.1
+    """Of the step that ends it, rms over the nodes, a tenth of the longest [px]."""
 
 
 _STAGES = (_Stage(Level(2, 3.0), 200.0, 0.4), _Stage(Level(2, 1.5), 80.0, 0.4), _Stage(FULL, 40.0))
 """Before the last one, which has the unfiltered images, too, and the cut-off that is sought."""
-_LAST_TOLERANCE_PX = 5e-3
+_LAST_TOLERANCE_PX = 0.01
 _LONGEST_STEP_PX = 8.0
 """Of a node, in one step."""
 
@@ -296,10 +296,11 @@ class _Measurement:
             length = np.linalg.norm(step.reshape(-1, 2), axis=1) / px
             share = np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
-            rms = float(np.sqrt(np.mean(length**2)))
-            if isinstance(self.prior, Imbalance) or rms > min(_SHORT_PX, 0.5 * last):
+            rms, longest = float(np.sqrt(np.mean(length**2))), float(length.max())
+            is_short = rms <= min(_SHORT_PX, 0.5 * last) and longest <= _SHORT_AT_A_NODE_PX
+            if isinstance(self.prior, Imbalance) or not is_short:
                 self.kept = None
-            if (last := rms) < stage.tolerance_px:
+            if max(last := rms, 0.1 * longest) < stage.tolerance_px:
                 break
 
     def regularise(self) -> None:
