@@ -16,6 +16,7 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.materials import JetMatrix, Ogden, stress_and_tangent
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.finite_element.identification.identify import UnlikeDataError
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.idic.uncertainty.parameters import compared_by_evidence
 from modeharvest.imaging.distortion.files import write_distortion
@@ -290,6 +291,45 @@ def test_images_of_the_other_branch_are_noticed(tmp_path: Path) -> None:
     assert found["warnings"] == true["warnings"] == []
     for p, same in zip(found["parameters"][:3], true["parameters"], strict=True):
         assert abs(p["value"] - same["value"]) < p["sd"]  # which has the place as unknowns, too
+
+
+NEVER = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("costs", "is_buckled", "best"),
+    [
+        ({"buckled+": None}, True, "buckled+"),
+        ({"buckled+": 3.0, "buckled-": None}, True, "buckled-"),
+        ({"buckled+": 3.0, "buckled-": 2.0}, True, "buckled-"),
+        ({"buckled+": 3.0, "buckled-": 4.0}, True, "buckled+"),
+        ({"buckled+": 3.0, "buckled-": NEVER}, True, "buckled+"),
+        ({"buckled+": 3.0, "buckled-": None}, False, "buckled+"),
+    ],
+)
+def test_the_other_branch_is_tried_where_states_are_unlike(
+    costs: dict[str, float | None], is_buckled: bool, best: str,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:  # fmt: skip
+    """Costs are those of states unlike the data: none where they are alike, NaN without states."""
+
+    def identified(
+        _: IdentificationRun, case: IdentificationCase, unlike_is_error: bool = False
+    ) -> tuple[str, None]:
+        (named,) = case.experiment.branches
+        if (cost := costs[named]) is not None and np.isnan(cost):
+            raise InputError("no states")
+        if cost is not None and unlike_is_error:
+            state: Any = SimpleNamespace(branch=named if is_buckled else "primary")
+            raise UnlikeDataError([state], cost)
+        return named, None
+
+    monkeypatch.setattr(IdentificationRun, "_identified", identified)
+    case = IdentificationCase.model_validate(BEFORE)
+    found, _, statements = IdentificationRun(case, tmp_path)._best(case)
+    assert found == best
+    text = "the specimen is on buckled-: on buckled+ the model fits worse"
+    assert statements == [text] * (best == "buckled-")
 
 
 @pytest.mark.parametrize(("branch", "travel"), [("buckled+", 1.0), ("buckled-", 1.01)])

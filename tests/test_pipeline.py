@@ -126,7 +126,7 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
     monkeypatch.setattr(whole_field, "get_num_threads", lambda: 2)
     where = case, "--out", folder, "--whole-field"
     assert called(monkeypatch, "validate", *where) == 2
-    assert "make them with 'modeharvest correlate'" in error_line(capsys)
+    assert "make them with 'modeharvest correlate --whole-field'" in error_line(capsys)
     assert called(monkeypatch, "correlate", *where) == 0
     assert capsys.readouterr().out.count("whole displacement: ") == 2
     assert called(monkeypatch, "validate", *where) == 0

@@ -125,6 +125,13 @@ def test_references_are_drawn_from_the_code(site: Path, page: str, texts: list[s
 
 
 @pytest.mark.dolfinx
+def test_no_page_differs_from_build_to_build(site: Path) -> None:
+    """As by the address of an object, where its text would be."""
+    for path in site.rglob("*.html"):
+        assert not re.search(r"\bat 0x[0-9a-f]{6,}", path.read_text("utf-8")), path.name
+
+
+@pytest.mark.dolfinx
 def test_it_can_be_searched(site: Path) -> None:
     text = (site / "searchindex.js").read_text("utf-8")
     index = json.loads(text[text.index("{") : text.rindex("}") + 1])

@@ -13,6 +13,8 @@ from sphinx.domains.python import PythonDomain
 from sphinx.environment import BuildEnvironment
 
 SOURCE = Path(__file__).resolve().parents[2] / "src" / "modeharvest"
+COMMANDS = "cli"
+"""The package of the commands, which have a page of their own."""
 DEPTH = 3
 """Of an API page's contents: the package, its modules, their classes and functions."""
 
@@ -41,10 +43,10 @@ class IndexedDomain(PythonDomain):
 
 
 def packages(folder: Path = SOURCE) -> dict[str, list[str]]:
-    """Packages by dotted names, and the modules of each."""
+    """Packages by dotted names, and the modules of each; not those of the commands."""
     found = {}
     for path in sorted(folder.iterdir()):
-        if path.is_dir() and (path / "__init__.py").exists():
+        if path.name != COMMANDS and (path / "__init__.py").exists():
             name = ".".join(path.relative_to(SOURCE.parent).parts)
             found[name] = sorted(p.stem for p in path.glob("*.py") if p.stem[0] != "_")
             found |= packages(path)

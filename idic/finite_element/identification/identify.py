@@ -53,6 +53,14 @@ _SETTLED = 0.05  # standard errors, rms: of the last of them
 _UNLIKE = 1.5  # times what noise alone makes: a residual that says so
 
 
+class UnlikeDataError(InputError):
+    """The states that look most like the data don't look like them; ``cost``: by the cost."""
+
+    def __init__(self, states: Sequence[ModelState], cost: float) -> None:
+        super().__init__("expected states that look like the data, got residuals far above noise")
+        self.states, self.cost = states, cost
+
+
 Model = Callable[[FloatArray], "Sequence[ModelState]"]
 """The states for values of the unknowns (k,); InputError where there are none."""
 
@@ -176,11 +184,6 @@ class Identified:
         bounded = np.diag([float(u.prior_sd is None) for u in unknowns])
         occam = 0.5 * float(np.linalg.slogdet(H * np.outer(sizes, sizes) + bounded)[1])
         return -costs[1] - occam, costs[0] - costs[1]
-
-    @property
-    def is_unlike(self) -> bool:
-        """Whether a state's residual is far above its noise."""
-        return any(part.residual > _UNLIKE * part.expected for part in self.state_equations)
 
     @property
     def is_rejected(self) -> bool:
@@ -309,6 +312,7 @@ def identify(
     finer: FinerMesh | None = None,
     corrections: FloatArray | None = None,
     omitted: Model | None = None,
+    unlike_is_error: bool = False,
     progress: Progress = silent,
 ) -> Identified:
     """Find the unknowns for which a model's states look like the data; InputError without states.
@@ -325,6 +329,8 @@ def identify(
         model is tested.
     omitted : the states with derivatives by further parameters alone, which are 0 in the model:
         factors of terms that its law may lack, by which the law is tested.
+    unlike_is_error : whether residuals far above noise are an UnlikeDataError, before the finer
+        mesh is asked; else a statement says so.
     """
     if not any(data) and forces is None:
         raise InputError("expected images, displacements or forces to identify from, got none")
@@ -348,6 +354,8 @@ def identify(
         if part is not None:
             part.weigh_by_reference()
     values, states = _finished(cost, values, cost.states)
+    if unlike_is_error and _are_unlike(cost.state_equations(states)):
+        raise UnlikeDataError(states, cost.equations_at(states, values).cost)
     begin, factor = values, 0.0
     if finer is not None:
         values, states = _finished(cost, values, finer.model)
@@ -356,6 +364,11 @@ def identify(
     found = replace(found, unknowns=values)
     result = _assessed(cost, states, found, off, factor, corrections, omitted)
     return replace(result, values=values + off)
+
+
+def _are_unlike(shares: Sequence[StateEquations]) -> bool:
+    """Whether a state's residual is far above its noise."""
+    return any(share.residual > _UNLIKE * share.expected for share in shares)
 
 
 def _finished(cost: _Cost, values: FloatArray, model: Model) -> tuple[FloatArray, list[ModelState]]:

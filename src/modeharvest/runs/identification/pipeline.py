@@ -29,6 +29,7 @@ from modeharvest.idic.finite_element.identification.identify import (
     Identified,
     Readings,
     Unknown,
+    UnlikeDataError,
     identify,
 )
 from modeharvest.idic.finite_element.identification.model_error import corrections
@@ -197,22 +198,27 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     def _best(self, case: IdentificationCase, *data: Any) -> tuple[Identified, Any, list[str]]:
         """A case's unknowns, on the other branch if they fit better there, and the model."""
-        found, model = self._identified(case, *data)
-        named = case.experiment.branches[0]
-        if not (found.is_unlike and any(s.branch in _OTHER for s in found.states)):
-            return found, model, []
-        experiment = replace(case.experiment, branches=(_OTHER[named],))
         try:
-            other = self._identified(case.model_copy(update={"experiment": experiment}), *data)
+            return *self._identified(case, *data, unlike_is_error=True), []
+        except UnlikeDataError as error:
+            unlike = error
+        named = case.experiment.branches[0]
+        experiment = replace(case.experiment, branches=(_OTHER[named],))
+        other = case.model_copy(update={"experiment": experiment})
+        text = f"the specimen is on {_OTHER[named]}: on {named} the model fits worse"
+        try:
+            if any(state.branch in _OTHER for state in unlike.states):
+                return *self._identified(other, *data, unlike_is_error=True), [text]
+        except UnlikeDataError as error:
+            if error.cost < unlike.cost:
+                return *self._identified(other, *data), [text]
         except InputError:  # it doesn't reach the states
-            return found, model, []
-        if other[0].minimum.equations.cost > found.minimum.equations.cost:
-            return found, model, []
-        return *other, [f"the specimen is on {_OTHER[named]}: on {named} the model fits worse"]
+            pass
+        return *self._identified(case, *data), []
 
     def _identified(
         self, case: IdentificationCase, data: list[StateObservation | None],
-        forces: Readings | None, px: float, frame: dict[str, Unknown],
+        forces: Readings | None, px: float, frame: dict[str, Unknown], **how: bool,
     ) -> tuple[Identified, Any]:  # fmt: skip
         """A case's unknowns, and the camera's, by the data; and the model."""
         experiment = case.experiment
@@ -243,12 +249,12 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             ),
             corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
             omitted=lambda values: model.omitted_terms(values[: len(unknowns)]),
-            progress=self.progress,
+            progress=self.progress, **how,
         )  # fmt: skip
         if not (near := self._beside_critical(found, fine)):
             return found, model
         wider = case.model_copy(update={"unknowns": case.unknowns | near})
-        other = self._identified(wider, data, forces, px, frame)
+        other = self._identified(wider, data, forces, px, frame, **how)
         return min((found, model), other, key=lambda pair: pair[0].minimum.equations.cost)
 
     def _beside_critical(self, found: Identified, fine: Any) -> dict[str, Unknown]:
