@@ -151,8 +151,8 @@ class Run(StagedRun[Case]):
         measured = self._measure_key(correlated)
         if self.case.whole_field.measure and not self.is_finished("measure", measured):
             raise InputError(
-                f"expected this case's whole displacements in {self._whole_fields.folder}, found none "
-                "that are whole; make them with 'modeharvest correlate --whole-field'"
+                f"expected whole displacements of this case in {self._whole_fields.folder}, got "
+                "none; make them with 'modeharvest correlate --whole-field'"
             )
         path, page = self.folder / "summary.json", self.folder / "report.html"
 
