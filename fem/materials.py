@@ -179,7 +179,7 @@ def _series(s: Any, m: float) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Jet:
-    """Values (k,) with derivatives by the four components of F: (4, k) and (4, 4, k)."""
+    """Values (k,) with derivatives by the four components of F, or none: (4, k) and (4, 4, k)."""
 
     value: FloatArray
     slope: FloatArray
@@ -235,13 +235,13 @@ class Jet:
 class JetMatrix:
     """F as a 2 x 2 matrix of jets, and the functions of it that UFL calls by the same names."""
 
-    def __init__(self, F: FloatArray) -> None:
-        count, self._entries = len(F), dict[tuple[int, int], Jet]()
+    def __init__(self, F: FloatArray, derivatives: int = 4) -> None:
+        (count, d), self._entries = (len(F), derivatives), dict[tuple[int, int], Jet]()
         for i in (0, 1):
             for j in (0, 1):
-                slope = np.zeros((4, count))
-                slope[2 * i + j] = 1.0
-                self._entries[i, j] = Jet(F[:, i, j], slope, np.zeros((4, 4, count)))
+                slope = np.zeros((d, count))
+                slope[2 * i + j :][:1] = 1.0
+                self._entries[i, j] = Jet(F[:, i, j], slope, np.zeros((d, d, count)))
 
     def __getitem__(self, at: tuple[int, int]) -> Jet:
         return self._entries[at]

@@ -82,9 +82,9 @@ OWN_BOUNDS = {
     HOMOGENIZATION: (19, 3_810), OWN_CELLS: (7, 960), IDENTIFICATION: (19, 4_076),
     DESIGN: (6, 864),
     FIRST_TOUCH: (3, 350),
-    CONTOURS: (11, 4_129), SEQUENCES: (10, 2_768), EXPLORE: (2, 300), SHARED_DATA: (3, 450),
+    CONTOURS: (11, 4_158), SEQUENCES: (10, 2_768), EXPLORE: (2, 300), SHARED_DATA: (3, 450),
     GAUGES_AND_FORMATS: (9, 1_739),
-    WHOLE_DISPLACEMENT: (7, 2_194),
+    WHOLE_DISPLACEMENT: (7, 2_201),
 }  # fmt: skip
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 

@@ -39,7 +39,7 @@ from modeharvest.idic.finite_element.fields import interpolation_error, nodal_gr
 from modeharvest.idic.finite_element.result import NodalResult, located
 from modeharvest.idic.finite_element.system import SAMPLES, SOME, Body, Imbalance
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.photographs.contour import Contour, SeenContours
+from modeharvest.imaging.photographs.contour import Contours, SeenContours
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.elements import shape_functions
 from modeharvest.util.errors import InputError
@@ -100,10 +100,10 @@ class _Edge:
         self.shapes = csr_array((values, (rows, cols)), shape)
         every = np.vstack([contour.points for contour in seen.reference])
         number = np.repeat(np.arange(len(seen.reference)), [len(c.points) for c in seen.reference])
-        self.number, self.deformed = number[cKDTree(every).query(self.points)[1]], seen.deformed
-        self.off: FloatArray = np.zeros(len(self.points))
-        off, _ = self._distances(self.points, seen.reference)
-        self.off = np.nan_to_num(off)
+        self.number = number[cKDTree(every).query(self.points)[1]]
+        self.deformed = Contours(seen.deformed)
+        off, _ = Contours(seen.reference).distance(self.points, self.number)
+        self.off: FloatArray = np.nan_to_num(off)
         is_part = not all(contour.closed for contour in seen.reference)
         self.cut = np.where(is_part, _cut_ligaments(mesh, sides, grid), -1).repeat(t.size)
         """(q,) number of the ligament that the image's border cuts, from 0; -1 elsewhere."""
@@ -122,15 +122,6 @@ class _Edge:
         self.at_dots = csr_array((values, (of, own.ravel())), shape=size)
         both = np.arange(len(dots)).repeat(2)
         self._springs = csr_array(vstack([self.shapes, self.at_dots[both]], "csr"))
-
-    def _distances(
-        self, x: FloatArray, contours: Sequence[Contour]
-    ) -> tuple[FloatArray, FloatArray]:
-        d, normal = np.empty(len(x)), np.empty_like(x)
-        for k, contour in enumerate(contours):
-            own = self.number == k
-            d[own], normal[own] = contour.distance(x[own])
-        return d - self.off, normal
 
     def loads(self, tractions: FloatArray) -> FloatArray:
         """(2 n, k) nodal forces of tractions (q, 2, k) [N/mm]."""
@@ -161,7 +152,8 @@ class _Edge:
 
         Both are 0 where a point has left the image.
         """
-        d, normal = self._distances(self.points + self.shapes @ u, self.deformed)
+        d, normal = self.deformed.distance(self.points + self.shapes @ u, self.number)
+        d -= self.off
         off = self.at_dots @ u - self.dots_moved
         along = np.tile(np.eye(2), (len(off), 1))
         return np.append(np.nan_to_num(d), off.ravel()), np.vstack([normal, along])
@@ -261,17 +253,12 @@ class _PenalisedBody:
         """Of edges and dots from where they are seen, and their gradients, as they are now."""
         return self.edge.distances(self.u.reshape(-1, 2))
 
-    def _deformation_gradient(self, u: FloatArray) -> FloatArray:
-        """(m, q, 2, 2) F at the points of each element [-]."""
-        cells = u.reshape(-1, 2)[self.mesh.cells]
-        return np.asarray(np.eye(2) + np.einsum("eai,eqaj->eqij", cells, self.law.slopes))
-
     def energy(self, u: FloatArray) -> float:
         """Of the body and its springs [N/mm times mm]; infinite where it is turned inside out."""
-        F = self._deformation_gradient(u)
+        F = self.law.deformation_gradient(u)
         if np.linalg.det(F).min() < _LEAST_DET:
             return np.inf
-        W = self.law.material.energy(JetMatrix(F.reshape(-1, 2, 2))).value
+        W = self.law.material.energy(JetMatrix(F.reshape(-1, 2, 2), 0)).value
         d, _ = self.edge.distances(u.reshape(-1, 2))
         springs = self.stiffness * float(self.edge.length @ d**2)
         plates = self.plates @ u + self.stretched
@@ -294,7 +281,7 @@ class _PenalisedBody:
         """Factorise, the order of elimination kept; ArithmeticError if it is singular."""
         A.sort_indices()
         if self._factor is None or self._stored != A.nnz:
-            self._factor, self._stored = factorise(A), A.nnz
+            self._factor, self._stored = factorise(A, block=2), A.nnz
         else:
             self._factor.update(A)
         return self._factor
@@ -354,7 +341,7 @@ class _PenalisedBody:
 
     def stress(self) -> float:
         """Rms of a component of the first Piola-Kirchhoff stress over the body, over mu [-]."""
-        F = self._deformation_gradient(self.u)
+        F = self.law.deformation_gradient(self.u)
         P = stress_and_tangent(self.law.material, F.reshape(-1, 2, 2))[0] / self.shear
         weights = np.broadcast_to(self.law.weights, F.shape[:2]).ravel()
         return float(np.sqrt(np.average((P**2).mean(axis=(1, 2)), weights=weights)))

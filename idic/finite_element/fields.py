@@ -116,7 +116,7 @@ FIELDS: dict[str, Field] = {
     "P": Field(_ALL, _of_material(_first_piola), "MPa", True),
     "cauchy": Field(_SYMMETRIC, _of_material(_cauchy), "MPa", True),
     "energy_density": Field(
-        "", _of_material(lambda law, F: np.asarray(law.energy(JetMatrix(F)).value)), "MPa", True
+        "", _of_material(lambda law, F: np.asarray(law.energy(JetMatrix(F, 0)).value)), "MPa", True
     ),
 }
 """By their names: F; J = det F; the angle of R in F = RU, counter-clockwise; the larger and smaller

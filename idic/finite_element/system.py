@@ -289,23 +289,30 @@ class Imbalance:
         F = np.einsum("eki,qkj->eqij", x, local)
         self.slopes = np.einsum("qkj,eqji->eqki", local, np.linalg.inv(F))
         self.weights = np.linalg.det(F) / 6.0
+        slopes = self.slopes.swapaxes(2, 3)  # (m, q, 2, k)
+        row = np.arange(slopes.size // slopes.shape[3]).repeat(slopes.shape[3])
+        col = np.broadcast_to(mesh.cells[:, None, None], slopes.shape).ravel()
+        self._gradient = csr_array((slopes.ravel(), (row, col)), (row[-1] + 1, len(mesh.nodes)))
         self._free = csr_array(diags_array(np.repeat(~loaded, 2).astype(float)))
         self._pattern = NodalPattern.of(len(mesh.nodes), mesh.cells)
 
+    def deformation_gradient(self, u: FloatArray) -> FloatArray:
+        """(m, q, 2, 2) F at the points of each element [-], of displacements (2 n,) [mm]."""
+        found = (self._gradient @ u.reshape(-1, 2)).reshape(*self.weights.shape, 2, 2)
+        return np.asarray(np.eye(2) + found.swapaxes(2, 3))
+
     def forces(self, u: FloatArray) -> tuple[FloatArray, csr_array]:
         """(2 n,) internal forces at u (2 n,) and their derivatives (2 n, 2 n), up to a factor."""
-        cells = self.mesh.cells
-        F = np.eye(2) + np.einsum("eai,eqaj->eqij", u.reshape(-1, 2)[cells], self.slopes)
+        F = self.deformation_gradient(u)
         there = np.linalg.det(F) > _LEAST_DET
         F[~there] = np.eye(2)
         P, A = stress_and_tangent(self.material, F.reshape(-1, 2, 2))
         w = (self.weights * there)[..., None, None]
         P, A = P.reshape(F.shape) * w, A.reshape(*F.shape, 2, 2) * w[..., None, None]
-        parts = np.einsum("eqij,eqaj->eai", P, self.slopes, optimize=True)
         half = np.einsum("eqijkl,eqbl->eqijkb", A, self.slopes, optimize=True)
         K = np.einsum("eqijkb,eqaj->eikab", half, self.slopes, optimize=True)
-        f = nodal_sums(len(self.mesh.nodes), cells, parts).ravel()
-        return f, self._pattern.assembled(cells, K.reshape(-1, 4, 6, 6))
+        f = self._gradient.T @ P.swapaxes(2, 3).reshape(-1, 2)
+        return f.ravel(), self._pattern.assembled(self.mesh.cells, K.reshape(-1, 4, 6, 6))
 
     def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
         """(2 n, 2 n) K'DK and (2 n,) K'Df."""

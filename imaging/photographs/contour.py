@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, IntArray
 
 _FINE_PX = 0.25
 """Between the points of a contour among which the nearest is sought."""
@@ -36,12 +37,6 @@ class Contour:
         self._curve = CubicSpline(s, through, bc_type="periodic" if closed else "not-a-knot")
 
     @cached_property
-    def _fine(self) -> tuple[FloatArray, cKDTree]:
-        step = _FINE_PX * self.length / len(self.points)
-        s = np.linspace(0.0, self.length, int(self.length / step), endpoint=not self.closed)
-        return np.asarray(s, dtype=np.float64), cKDTree(self._curve(s))
-
-    @cached_property
     def moments(self) -> tuple[float, FloatArray, FloatArray]:
         """Signed area [mm^2], centroid (2,) [mm], second central moments (2, 2) over it [mm^2]."""
         p, q = self.points, np.roll(self.points, -1, axis=0)
@@ -60,27 +55,74 @@ class Contour:
         step = self.length / (count if self.closed else count - 1)
         return self._curve(np.arange(count) * step), step
 
+    def _evenly_fine(self) -> FloatArray:
+        """(k,) arc lengths [mm], from which the nearest point of the curve is found."""
+        step = _FINE_PX * self.length / len(self.points)
+        count = int(self.length / step)
+        return np.linspace(0.0, self.length, count, endpoint=not self.closed, dtype=np.float64)
+
     def distance(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n,) signed distance of points (n, 2) from the curve [mm], and (n, 2) its gradient.
 
         NaN and 0 beyond the ends of a curve that is cut.
         """
-        fine, tree = self._fine
-        s, step = fine[tree.query(x)[1]], self.length / len(self.points)
+        return self._alone.distance(x, np.zeros(len(x), dtype=np.int64))
+
+    @cached_property
+    def _alone(self) -> Contours:
+        return Contours((self,))
+
+
+class Contours:
+    """Several contours, from one of which each point's distance is asked for: all at once."""
+
+    def __init__(self, contours: Sequence[Contour]) -> None:
+        self.length = np.array([contour.length for contour in contours])
+        self.is_cut = np.array([not contour.closed for contour in contours])
+        self.step = self.length / [len(contour.points) for contour in contours]
+        # The arc lengths s of all contours follow one another, with gaps.
+        self._begin = 2.0 * np.cumsum(self.length) - self.length
+        curves, fine = [c._curve for c in contours], [c._evenly_fine() for c in contours]
+        pairs = zip(self._begin, curves, strict=True)
+        self._knots = np.concatenate([s + c.x[:-1] for s, c in pairs])
+        self._coefficients = np.concatenate([c.c for c in curves], axis=1)
+        self._fine = np.concatenate(fine)
+        points = np.vstack([c(s) for c, s in zip(curves, fine, strict=True)])
+        self._far = 10.0 * float(np.ptp(points, axis=0).max() + self.length.max())
+        number = np.repeat(np.arange(len(fine)), [len(s) for s in fine])
+        self._tree = cKDTree(self._apart(points, number))
+
+    def _apart(self, x: FloatArray, number: IntArray) -> FloatArray:
+        """(n, 3) points (n, 2), those of different contours far from each other."""
+        return np.column_stack([x, self._far * number])
+
+    def _at(self, s: FloatArray, number: IntArray) -> tuple[FloatArray, ...]:
+        """(n, 2) points of the contours, and their first and second derivatives by s."""
+        at = self._begin[number] + s
+        piece = np.searchsorted(self._knots, at, "right") - 1
+        (a, b, c, d), t = self._coefficients[:, piece], (at - self._knots[piece])[:, None]
+        return ((a * t + b) * t + c) * t + d, (3.0 * a * t + 2.0 * b) * t + c, 6.0 * a * t + 2.0 * b
+
+    def distance(self, x: FloatArray, number: IntArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) signed distance of points (n, 2) from their contours [mm], (n, 2) its gradient.
+
+        ``number`` (n,): of each point's contour. NaN and 0 beyond the ends of one that is cut.
+        """
+        s = self._fine[self._tree.query(self._apart(x, number))[1]]
+        step, length, is_cut = self.step[number], self.length[number], self.is_cut[number]
         for _ in range(3):
-            off, along, bent = self._curve(s) - x, self._curve(s, 1), self._curve(s, 2)
-            square = (along**2).sum(axis=1)
+            there, along, bent = self._at(s, number)
+            off, square = there - x, (along**2).sum(axis=1)
             slope = square + (off * bent).sum(axis=1)
             slope = np.where(slope > 0.2 * square, slope, square)
             s = s - np.clip((off * along).sum(axis=1) / slope, -step, step)
-            s = np.mod(s, self.length) if self.closed else np.clip(s, 0.0, self.length)
-        along, off = self._curve(s, 1), x - self._curve(s)
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
+            s = np.where(is_cut, np.clip(s, 0.0, length), np.mod(s, length))
+        there, along, _ = self._at(s, number)
+        along, off = along / np.linalg.norm(along, axis=1, keepdims=True), x - there
         normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
         d = (off * normal).sum(axis=1)
-        if not self.closed:
-            beyond = np.abs((off * along).sum(axis=1)) > step
-            d[beyond], normal[beyond] = np.nan, 0.0
+        beyond = is_cut & (np.abs((off * along).sum(axis=1)) > step)
+        d[beyond], normal[beyond] = np.nan, 0.0
         return d, normal
 
 
