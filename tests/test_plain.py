@@ -201,10 +201,7 @@ def test_edges_beside_the_border_of_the_picture_are_contours_all_the_same() -> N
 
 
 def test_a_start_inside_out_ends_in_one_line(photographed: Path) -> None:
-    f, g = (
-        read_image(photographed / f"{name}_8bit.tif")[60:-60, 60:-60]
-        for name in ("reference", "deformed_1280")
-    )
+    f, g, _ = cropped(photographed, "middle")
     grid, surface, other = PixelGrid.centred(*f.shape, 0.04), plain_surface(f), plain_surface(g)
     assert surface
     assert other

@@ -31,7 +31,7 @@ reference = read_image(folder / "bench/reference.tif")
 deformed = read_image(folder / "bench/deformed_0780.tif")
 rows, cols = np.mgrid[4 : reference.shape[0] : 4, 4 : reference.shape[1] : 4]
 for radius in (5, 15):
-    down, right = optical_flow_ilk(reference, deformed, radius=radius, num_warp=20)
+    down, right = optical_flow_ilk(reference, deformed, radius=radius, num_warp=10)
     values = [cols, rows, right[rows, cols], down[rows, cols]]
     header, table = "x [px],y [px],u [px],v [px]", np.column_stack([v.ravel() for v in values])
     np.savetxt(folder / f"flow_{radius}.csv", table, "%.6g", ",", header=header, comments="")
