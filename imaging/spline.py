@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline
 
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.compiled import compiled, in_parallel, readable
+from modeharvest.util.compiled import compiled, in_parallel
 from modeharvest.util.errors import InputError
 
 ORDERS = (3, 5, 11)
@@ -72,12 +72,12 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     pixels, and so are the coefficients: ``pad`` [px] rows and columns of them are put around it.
     """
     rows, cols = image.shape
-    padded = np.empty((rows + 2 * pad, cols + 2 * pad), dtype=image.dtype)
+    padded = np.pad(image, pad)
     interior = padded[pad : pad + rows, pad : pad + cols]
     z = poles(order)
     gain = float(np.prod((1.0 - z) * (1.0 - 1.0 / z)))
-    in_parallel(_filter_columns, readable(image), z, _mirrored(z, rows), gain, interior)
-    in_parallel(_filter_columns, interior.T, z, _mirrored(z, cols), gain, interior.T)
+    in_parallel(_filter_columns, interior, z, _mirrored(z, rows), gain)
+    in_parallel(_filter_columns, interior.T, z, _mirrored(z, cols), gain)
     _pad_mirrored(padded, pad)
     return padded
 
@@ -125,9 +125,9 @@ def _filter(lines: Any, n: int, poles: Any, first: Any, gain: float) -> None:
 
 @compiled(relaxed=True)
 def _filter_columns(
-    image: Any, poles: Any, first: Any, gain: float, out: Any, thread: int, threads: int
+    image: Any, poles: Any, first: Any, gain: float, thread: int, threads: int
 ) -> None:
-    """Filter ``image`` along its columns into ``out``, which may be the image itself."""
+    """Filter an image along its columns, in place."""
     rows, cols = image.shape
     for block in range(thread, (cols + _LINES - 1) // _LINES, threads):
         lines = np.zeros((rows, _LINES))
@@ -138,7 +138,7 @@ def _filter_columns(
         _filter(lines, rows, poles, first, gain)
         for i in range(rows):
             for m in range(width):
-                out[i, left + m] = lines[i, m]
+                image[i, left + m] = lines[i, m]
 
 
 def _pad_mirrored(padded: NDArray[Any], pad: int) -> None:
