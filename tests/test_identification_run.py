@@ -36,6 +36,8 @@ from modeharvest.runs.identification.pipeline import (
 from modeharvest.util.elements import reference_element
 from modeharvest.util.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("unrendered_pictures")
+
 SPECIMEN = {"holes_x": 4, "holes_y": 2, "diameter": 1.5, "bulk_x": 0.9, "bulk_y": 0.4}
 BEFORE: dict[str, Any] = {
     "title": "small",

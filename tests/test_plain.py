@@ -39,6 +39,8 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.validation.whole_field import v_percent, waves_percent
 
+pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
+
 SHIPPED = Path(__file__).parents[1] / "src/modeharvest/cases/paper-virtual.h5"
 PLAIN = ImagingSpec(
     pixel_size=0.04,
