@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 FORMAT = "modeharvest-solution-1"
 COMPRESSED = {"compression": 1, "shuffle": True}
-"""Of datasets in HDF5: more takes several times as long for one hundredth of the size."""
+"""Of datasets in HDF5: more takes twice as long, for a hundredth less of measured displacements."""
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
 _FLAT = 1e-6  # of a plane mesh's size: what its z may differ by
 MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}

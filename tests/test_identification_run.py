@@ -299,36 +299,40 @@ NEVER = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("costs", "is_buckled", "best"),
+    ("costs", "best"),
     [
-        ({"buckled+": None}, True, "buckled+"),
-        ({"buckled+": 3.0, "buckled-": None}, True, "buckled-"),
-        ({"buckled+": 3.0, "buckled-": 2.0}, True, "buckled-"),
-        ({"buckled+": 3.0, "buckled-": 4.0}, True, "buckled+"),
-        ({"buckled+": 3.0, "buckled-": NEVER}, True, "buckled+"),
-        ({"buckled+": 3.0, "buckled-": None}, False, "buckled+"),
+        ({"buckled+": None}, "buckled+"),
+        ({"buckled+": 3.0, "buckled-": None}, "buckled-"),
+        ({"buckled+": 3.0, "buckled-": 2.0}, "buckled-"),
+        ({"buckled+": 3.0, "buckled-": 4.0}, "buckled+"),
+        ({"buckled+": 3.0, "buckled-": NEVER}, "buckled+"),
+        ({"primary": 3.0}, "primary"),
     ],
 )
 def test_the_other_branch_is_tried_where_states_are_unlike(
-    costs: dict[str, float | None], is_buckled: bool, best: str,
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-) -> None:  # fmt: skip
+    costs: dict[str, float | None], best: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Costs are those of states unlike the data: none where they are alike, NaN without states."""
 
     def identified(
         _: IdentificationRun, case: IdentificationCase, unlike_is_error: bool = False
-    ) -> tuple[str, None]:
+    ) -> tuple[Any, str]:
         (named,) = case.experiment.branches
-        if (cost := costs[named]) is not None and np.isnan(cost):
+        cost = costs[named]
+        if cost is not None and np.isnan(cost):
             raise InputError("no states")
         if cost is not None and unlike_is_error:
-            state: Any = SimpleNamespace(branch=named if is_buckled else "primary")
-            raise UnlikeDataError([state], cost)
-        return named, None
+            raise UnlikeDataError("unlike")
+        return SimpleNamespace(
+            states=[SimpleNamespace(branch=named)],
+            state_equations=[SimpleNamespace(residual=2.0 if cost else 1.0, expected=1.0)],
+            minimum=SimpleNamespace(equations=SimpleNamespace(cost=cost)),
+        ), named
 
     monkeypatch.setattr(IdentificationRun, "_identified", identified)
-    case = IdentificationCase.model_validate(BEFORE)
-    found, _, statements = IdentificationRun(case, tmp_path)._best(case)
+    experiment = BEFORE["experiment"] | {"branches": [next(iter(costs))]}
+    case = IdentificationCase.model_validate(BEFORE | {"experiment": experiment})
+    _, found, statements = IdentificationRun(case, tmp_path)._best(case)
     assert found == best
     text = "the specimen is on buckled-: on buckled+ the model fits worse"
     assert statements == [text] * (best == "buckled-")

@@ -211,14 +211,14 @@ def test_continued_pixels_weigh_by_how_wrong_they_are() -> None:
 
 
 @pytest.mark.parametrize("edge_px", [0, 3])
-def test_pixels_amid_the_material_need_not_be_looked_at_one_by_one(edge_px: int) -> None:
+def test_blocks_inside_the_material_need_no_look_at_single_pixels(edge_px: int) -> None:
     """Where none around a block is continued or not valid, sums are the same without asking."""
     pair = plate_pair(quadratic_field, 0.002)
     body = FiniteElementOptions().body(pair.masks[0], pair.grid)
     level = images_on(pair, FULL, edge_px, 5)
     pixels = body.pixels.on(level.grid, level.mask & body.mask, level.reference)
     found = continued_pixels(pair, 4e-6, 4e-6, level.valid)
-    each = found._replace(above=NONE_CONTINUED.above)
+    each = found._replace(summed=NONE_CONTINUED.summed)
     for off in (0.0, 5.3):  # px, by which pixels of edges leave the deformed image's material
         u = quadratic_field(body.mesh.nodes) + off * GRID.pixel_size
         a, b = (normal_equations(pixels, body.mesh, level, u, by) for by in (found, each))

@@ -34,8 +34,8 @@ from scipy.spatial import cKDTree
 from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.materials import JetMatrix, Material, Ogden, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
-from modeharvest.idic.finite_element.cutoff import Deviations
-from modeharvest.idic.finite_element.fields import interpolation_error, nodal_gradient
+from modeharvest.idic.finite_element.cutoff import Deviations, gradient_covariance
+from modeharvest.idic.finite_element.fields import interpolation_error
 from modeharvest.idic.finite_element.result import NodalResult, located
 from modeharvest.idic.finite_element.system import SAMPLES, SOME, Body, Imbalance
 from modeharvest.imaging.grid import PixelGrid
@@ -506,8 +506,7 @@ def _deviations(
     found[:, :SAMPLES] = state.with_tractions(found[:, :SAMPLES], factor, off)
     known = float(np.sum(z * found[:, SAMPLES:])) / _PROBES
     samples = found[:, :SAMPLES].reshape(-1, 2, SAMPLES)
-    slopes = nodal_gradient(mesh, samples.reshape(len(samples), -1)).reshape(-1, 2, SAMPLES, 2)
-    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
+    spread = gradient_covariance(mesh, samples)
     error = interpolation_error(mesh, state.u.reshape(-1, 2))
     none = samples[..., :0]
     sd = Deviations(samples, none, none, error, spread).with_bias(mesh, left)

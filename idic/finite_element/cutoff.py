@@ -44,8 +44,7 @@ from modeharvest.idic.finite_element.fields import interpolation_error, mean_aro
 from modeharvest.idic.finite_element.system import SAMPLES, SOME, Linearised, Smoothness
 from modeharvest.util.arrays import FloatArray, IntArray
 
-_PROBES = 4
-_DEGREES = 1.4
+_PROBES, _DEGREES = 4, 1.4
 _STEP = 1.4
 """Between neighbouring cut-off wavelengths."""
 _TINY = float(np.finfo(np.float64).tiny)
@@ -194,10 +193,7 @@ def deviations(
     for _ in range(2):  # as much is taken as with the weight used in one step, or more
         again = at.factor(more).solve(more * (at.R @ again.ravel())).reshape(-1, 2)
     missing = change + share * (again - change)
-    slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
-    xx_xy_yx_yy = slopes.swapaxes(2, 3).reshape(-1, 4, SAMPLES)
-    spread = xx_xy_yx_yy @ xx_xy_yx_yy.swapaxes(1, 2) / SAMPLES
-    sd = Deviations(found, lost, none, error, spread, share * taken)
+    sd = Deviations(found, lost, none, error, gradient_covariance(mesh, found), share * taken)
     return sd.with_bias(mesh, change, _OF_SLOPES)._replace(changes=missing[..., None])
 
 
@@ -221,6 +217,14 @@ def contradicted(
     noise = np.mean((lawful.samples - free.samples) ** 2, axis=2)
     limit = _SIGNIFICANT * np.sqrt(noise + free.bias**2)
     return float(np.mean(np.abs(difference)[nodes] > limit[nodes]))
+
+
+def gradient_covariance(mesh: Mesh, samples: FloatArray) -> FloatArray:
+    """(n, 4, 4) covariance of xx, xy, yx, yy of grad u [-], by random displacements (n, 2, s)."""
+    n, _, count = samples.shape
+    slopes = nodal_gradient(mesh, samples.reshape(n, -1)).reshape(n, 2, count, 2)
+    J = slopes.swapaxes(2, 3).reshape(n, 4, count)
+    return np.asarray(J @ J.swapaxes(1, 2) / count)
 
 
 def smoothed(mesh: Mesh, nodal: FloatArray) -> FloatArray:

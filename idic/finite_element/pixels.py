@@ -76,8 +76,8 @@ class ContinuedPixels(NamedTuple):
     """(rows, cols) float32, 1 where a pixel is continued and 0 on material; (0, 0) for nowhere."""
     variance: float
     """Of a continued pixel's error, over that of the residual's noise [-]."""
-    above: NDArray[Any]
-    """(rows + 1, cols + 1) int32 how many of them, or not valid, are above and to the left."""
+    summed: NDArray[Any]
+    """(rows + 1, cols + 1) int32 summed-area table of them and of what isn't valid."""
 
 
 NONE_CONTINUED = ContinuedPixels(np.zeros((0, 0), np.float32), 0.0, np.zeros((0, 0), np.int32))
@@ -107,9 +107,8 @@ def continued_pixels(
         excess, noise = max(0.0, error - 2.0 * noise_g), noise_f + noise_g
         ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
     lost = ~mask if valid is None else ~(mask & valid)
-    above = np.pad(lost, ((1, 0), (1, 0))).astype(np.int32)
-    np.cumsum(np.cumsum(above, axis=0, out=above), axis=1, out=above)
-    return ContinuedPixels((~mask).astype(np.float32), ratio, above)
+    summed = np.pad(lost, ((1, 0), (1, 0))).cumsum(0, np.int32).cumsum(1, np.int32)
+    return ContinuedPixels((~mask).astype(np.float32), ratio, summed)
 
 
 def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
@@ -308,7 +307,7 @@ def normal_equations(
 @compiled(relaxed=True)
 def accumulate_elements(
     pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, outside: Any,
-    variance: float, above: Any, pixel_size: float, blocks: Any, gradient: Any, sums: Any,
+    variance: float, summed: Any, pixel_size: float, blocks: Any, gradient: Any, sums: Any,
     thread: int, threads: int,
 ) -> None:  # fmt: skip
     """Fill each element's own sums of products over its pixels."""
@@ -320,12 +319,12 @@ def accumulate_elements(
             n = min(_BLOCK, pixels.start[e + 1] - begin)
             _shapes(pixels.xi, begin, n, N)
             _map(pixels, begin, n, N, u[e], pixel_size, own)
-            amid = _is_amid(n, above, own)
-            at = valid[:0] if amid else valid
+            interior = _is_interior(n, summed, own)
+            at = valid[:0] if interior else valid
             _sample(pixels, begin, n, coefficients, order, at, pixel_size, own, sums[e])
             if pixels.slope.size:
                 _push_forward(pixels, begin, n, x[e], u[e], own, sums[e])
-            if outside.size and not amid:
+            if outside.size and not interior:
                 _weigh(n, outside, variance, own)
             for m in range(n):
                 sums[e, 0] += own[2, m] * own[2, m]
@@ -359,16 +358,14 @@ def _map(pixels: Any, begin: int, n: int, N: Any, u: Any, pixel_size: float, own
 
 
 @compiled(relaxed=True)
-def _is_amid(n: int, above: Any, own: Any) -> bool:
+def _is_interior(n: int, summed: Any, own: Any) -> bool:
     """Whether all pixels around a block's are those of the deformed image's material."""
-    if above.size == 0:
-        return False
     top, left = own[4, :n].min(), own[5, :n].min()
     bottom, right = own[4, :n].max() + 2.0, own[5, :n].max() + 2.0
-    if top < 0.0 or left < 0.0 or bottom >= above.shape[0] or right >= above.shape[1]:
+    if top < 0.0 or left < 0.0 or bottom >= summed.shape[0] or right >= summed.shape[1]:
         return False
     i, j, k, m = int(top), int(left), int(bottom), int(right)
-    return bool(above[k, m] - above[i, m] - above[k, j] + above[i, j] == 0)
+    return bool(summed[k, m] - summed[i, m] - summed[k, j] + summed[i, j] == 0)
 
 
 @compiled(relaxed=True)

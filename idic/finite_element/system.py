@@ -66,8 +66,7 @@ class NodalPattern:
         """From groups of nodes (m, k) that have to do with one another, out of ``count``."""
         rows = np.concatenate([np.repeat(g, g.shape[1], axis=1).ravel() for g in groups])
         cols = np.concatenate([np.tile(g, (1, g.shape[1])).ravel() for g in groups])
-        one = np.ones(rows.size, dtype=np.int8)
-        joined = csr_array((one, (rows, cols)), shape=(count, count))  # sorted, each once
+        joined = csr_array((np.ones(rows.size, np.int8), (rows, cols)), (count, count))  # each once
         return cls(joined.indptr.astype(np.int64), joined.indices.astype(np.int64))
 
     def assembled(self, nodes: IntArray, blocks: FloatArray) -> csr_array:

@@ -55,7 +55,7 @@ class Contour:
         step = self.length / (count if self.closed else count - 1)
         return self._curve(np.arange(count) * step), step
 
-    def _evenly_fine(self) -> FloatArray:
+    def _dense_lengths(self) -> FloatArray:
         """(k,) arc lengths [mm], from which the nearest point of the curve is found."""
         step = _FINE_PX * self.length / len(self.points)
         count = int(self.length / step)
@@ -82,7 +82,7 @@ class Contours:
         self.step = self.length / [len(contour.points) for contour in contours]
         # The arc lengths s of all contours follow one another, with gaps.
         self._begin = 2.0 * np.cumsum(self.length) - self.length
-        curves, fine = [c._curve for c in contours], [c._evenly_fine() for c in contours]
+        curves, fine = [c._curve for c in contours], [c._dense_lengths() for c in contours]
         pairs = zip(self._begin, curves, strict=True)
         self._knots = np.concatenate([s + c.x[:-1] for s, c in pairs])
         self._coefficients = np.concatenate([c.c for c in curves], axis=1)
@@ -90,9 +90,9 @@ class Contours:
         points = np.vstack([c(s) for c, s in zip(curves, fine, strict=True)])
         self._far = 10.0 * float(np.ptp(points, axis=0).max() + self.length.max())
         number = np.repeat(np.arange(len(fine)), [len(s) for s in fine])
-        self._tree = cKDTree(self._apart(points, number))
+        self._tree = cKDTree(self._separated(points, number))
 
-    def _apart(self, x: FloatArray, number: IntArray) -> FloatArray:
+    def _separated(self, x: FloatArray, number: IntArray) -> FloatArray:
         """(n, 3) points (n, 2), those of different contours far from each other."""
         return np.column_stack([x, self._far * number])
 
@@ -108,7 +108,7 @@ class Contours:
 
         ``number`` (n,): of each point's contour. NaN and 0 beyond the ends of one that is cut.
         """
-        s = self._fine[self._tree.query(self._apart(x, number))[1]]
+        s = self._fine[self._tree.query(self._separated(x, number))[1]]
         step, length, is_cut = self.step[number], self.length[number], self.is_cut[number]
         for _ in range(3):
             there, along, bent = self._at(s, number)

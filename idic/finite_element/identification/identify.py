@@ -54,11 +54,7 @@ _UNLIKE = 1.5  # times what noise alone makes: a residual that says so
 
 
 class UnlikeDataError(InputError):
-    """The states that look most like the data don't look like them; ``cost``: by the cost."""
-
-    def __init__(self, states: Sequence[ModelState], cost: float) -> None:
-        super().__init__("expected states that look like the data, got residuals far above noise")
-        self.states, self.cost = states, cost
+    """The states that look most like the data have residuals far above noise."""
 
 
 Model = Callable[[FloatArray], "Sequence[ModelState]"]
@@ -354,8 +350,8 @@ def identify(
         if part is not None:
             part.weigh_by_reference()
     values, states = _finished(cost, values, cost.states)
-    if unlike_is_error and _are_unlike(cost.state_equations(states)):
-        raise UnlikeDataError(states, cost.equations_at(states, values).cost)
+    if unlike_is_error and are_unlike(cost.state_equations(states)):
+        raise UnlikeDataError("expected states that look like the data, got others")
     begin, factor = values, 0.0
     if finer is not None:
         values, states = _finished(cost, values, finer.model)
@@ -366,7 +362,7 @@ def identify(
     return replace(result, values=values + off)
 
 
-def _are_unlike(shares: Sequence[StateEquations]) -> bool:
+def are_unlike(shares: Sequence[StateEquations]) -> bool:
     """Whether a state's residual is far above its noise."""
     return any(share.residual > _UNLIKE * share.expected for share in shares)
 

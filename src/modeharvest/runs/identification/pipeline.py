@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -30,6 +31,7 @@ from modeharvest.idic.finite_element.identification.identify import (
     Readings,
     Unknown,
     UnlikeDataError,
+    are_unlike,
     identify,
 )
 from modeharvest.idic.finite_element.identification.model_error import corrections
@@ -198,27 +200,29 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     def _best(self, case: IdentificationCase, *data: Any) -> tuple[Identified, Any, list[str]]:
         """A case's unknowns, on the other branch if they fit better there, and the model."""
-        try:
-            return *self._identified(case, *data, unlike_is_error=True), []
-        except UnlikeDataError as error:
-            unlike = error
         named = case.experiment.branches[0]
+        with suppress(UnlikeDataError):
+            return *self._identified(case, *data, unlike_is_error=True), []
+        if named not in _OTHER:
+            return *self._identified(case, *data), []
         experiment = replace(case.experiment, branches=(_OTHER[named],))
         other = case.model_copy(update={"experiment": experiment})
         text = f"the specimen is on {_OTHER[named]}: on {named} the model fits worse"
-        try:
-            if any(state.branch in _OTHER for state in unlike.states):
-                return *self._identified(other, *data, unlike_is_error=True), [text]
-        except UnlikeDataError as error:
-            if error.cost < unlike.cost:
-                return *self._identified(other, *data), [text]
-        except InputError:  # it doesn't reach the states
-            pass
-        return *self._identified(case, *data), []
+        with suppress(InputError):  # it doesn't reach the states, or they are as unlike
+            return *self._identified(other, *data, unlike_is_error=True), [text]
+        found, model = self._identified(case, *data)
+        is_buckled = any(state.branch in _OTHER for state in found.states)
+        with suppress(InputError):
+            if is_buckled and are_unlike(found.state_equations):
+                there = self._identified(other, *data)
+                if there[0].minimum.equations.cost <= found.minimum.equations.cost:
+                    return *there, [text]
+        return found, model, []
 
     def _identified(
         self, case: IdentificationCase, data: list[StateObservation | None],
-        forces: Readings | None, px: float, frame: dict[str, Unknown], **how: bool,
+        forces: Readings | None, px: float, frame: dict[str, Unknown],
+        *, unlike_is_error: bool = False,
     ) -> tuple[Identified, Any]:  # fmt: skip
         """A case's unknowns, and the camera's, by the data; and the model."""
         experiment = case.experiment
@@ -249,12 +253,12 @@ class IdentificationRun(StagedRun[IdentificationCase]):
             ),
             corrections=corrections(model.mesh.nodes, experiment.specimen.vectors),
             omitted=lambda values: model.omitted_terms(values[: len(unknowns)]),
-            progress=self.progress, **how,
+            unlike_is_error=unlike_is_error, progress=self.progress,
         )  # fmt: skip
         if not (near := self._beside_critical(found, fine)):
             return found, model
         wider = case.model_copy(update={"unknowns": case.unknowns | near})
-        other = self._identified(wider, data, forces, px, frame, **how)
+        other = self._identified(wider, data, forces, px, frame, unlike_is_error=unlike_is_error)
         return min((found, model), other, key=lambda pair: pair[0].minimum.equations.cost)
 
     def _beside_critical(self, found: Identified, fine: Any) -> dict[str, Unknown]:
