@@ -4,19 +4,21 @@ Each seed photographs the twin again: a 95 % interval of a field, 1.96 standard 
 about what one photograph shows, should hold the noise-free result in 95 of 100 of them. With
 --whole-field the whole displacement is measured in each, and its intervals, which count noise and
 smoothing, should hold the truth: those of u at the pixels of the material, and those of the
-ansatz refitted to it the ansatz' best fit to the truth.
+ansatz refitted to it the ansatz' best fit to the truth. What smoothing and edges make of u depends
+on the speckle: with --speckles each seed has a speckle and masks of its own, not only noise.
 
 Needs the twin's photographs and harvest (minutes), which it makes in out/twin unless they are
 there: modeharvest run paper-real-twin --out out/twin. Goes on where it was stopped.
 
 Run: scripts/env python benchmarks/twin_coverage.py [--seeds 100] [--workers 2] [--folder out/twin]
-     [--name deformed_1270] [--whole-field]
+     [--name deformed_1270] [--whole-field | --speckles]
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -27,10 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import correlate, fit_displacement
-from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import refitted
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.displacement import displacement_from
 from modeharvest.idic.photograph.measure import image_noise
 from modeharvest.idic.result import Result
@@ -38,14 +39,14 @@ from modeharvest.idic.uncertainty.covariance import FieldErrors, covariance, fie
 from modeharvest.imaging.distortion.lens import undistorted
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import Case, shipped_solution
-from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
-from modeharvest.runs.photographs.twin import Twin, TwinRun
+from modeharvest.runs.photographs.twin import Twin, TwinRun, make_twin
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.validation.campaign import Campaign, grid
 from modeharvest.validation.workers import Workers
 
-FUNCTION, WHOLE = "twin_coverage:one_seed", "twin_coverage:one_whole"
+NOISE, WHOLE, SPECKLE = (f"twin_coverage:{name}" for name in ("one_seed", "one_whole", "one_speckle"))
 EDGE_PX = 10
 SIZES = ["cutoff_px", "unknowns", "longest_px", "refit_px", "rms_px", "sd_px", "off_percent", "off"]
 INTERVAL = 1.96
@@ -92,8 +93,20 @@ def one_whole(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
     pixels, points and parameters covered, and the rms error over its standard deviation.
     """
     setup = _setup(folder, case["name"])
-    start, pair = setup.start, setup.pair.with_images(*setup.photographs(case["seed"]))
-    body, how = _meshed(folder, case["name"])
+    return _whole(setup, setup.pair.with_images(*setup.photographs(case["seed"])))
+
+
+def one_speckle(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
+    """Photograph another speckle and measure the whole displacement, as :func:`one_whole` does."""
+    setup, name = _setup(folder, case["name"]), case["name"]
+    with tempfile.TemporaryDirectory() as own:
+        other = setup.with_speckle(case["seed"], Path(own))
+        return _whole(other, other.harvesting.prepared.pair(name))
+
+
+def _whole(setup: _CoverageSetup, pair: ImagePair) -> dict[str, float]:
+    """Measure the whole displacement of a pair, and set it against the truth."""
+    (body, how), start = setup.harvesting._mesh, setup.start
     known, a = start.ansatz, start.unknowns
     gain, offset = known.gain_and_offset(a, pair.grid.x, pair.grid.y)
     pair = replace(pair, reference=((pair.reference - offset) / gain).astype(np.float32))
@@ -135,12 +148,6 @@ def _shares(parts: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, flo
         shares[f"covered {name}"] = float(np.mean(np.abs(ratio) <= INTERVAL))
         shares[f"deviation {name}"] = float(np.sqrt(np.mean(ratio**2)))
     return shares
-
-
-@lru_cache(maxsize=1)
-def _meshed(folder: Path, name: str) -> tuple[Body, FiniteElementOptions]:
-    """As the harvest measures."""
-    return _setup(folder, name).harvesting._mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +213,24 @@ class _CoverageSetup:
             taken.append(image if distortion is None else undistorted(image, distortion))
         return taken[0], taken[1]
 
+    def with_speckle(self, seed: int, folder: Path) -> _CoverageSetup:
+        """Another speckle and another noise on the same specimen, its masks found anew."""
+        case, images = Case.read("paper-real-twin"), self.twin.images
+        speckle, sensor = images.spec.speckle, images.spec.sensor
+        assert speckle.ink is not None and case.calibration is not None
+        speckle = replace(speckle, seed=1000 + seed, ink=replace(speckle.ink, seed=2000 + seed))
+        sensor = replace(sensor, shot_seed=1000 + seed, read_seed=2000 + seed)
+        case = case.model_copy(update={
+            "experiment": replace(case.experiment, strains=(self.strain,)),
+            "imaging": replace(images.spec, speckle=speckle, sensor=sensor),
+            "calibration": replace(case.calibration, shifts_px=((0.0, 0.0),)),
+        })  # fmt: skip
+        solution = Solution.read(self.twin.truth / "solution.h5")
+        twin = make_twin(case, solution, folder / "twin")
+        lens = DistortionTable(file=str((self.harvesting.folder / "distortion.json").resolve()))
+        photographs = PhotographCase.read(twin.experiment).model_copy(update={"distortion": lens})
+        return replace(self, twin=twin, harvesting=HarvestRun(photographs, folder / "harvest"))
+
     def measured(self, images: tuple[FloatImage, FloatImage]) -> Result:
         """Correlate as the harvest finished, from the harvest's result on."""
         options = self.harvesting.case.correlation.options()
@@ -239,7 +264,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("out/twin"))
     parser.add_argument("--name", default="deformed_1270")
-    parser.add_argument("--whole-field", action="store_true")
+    parser.add_argument("--whole-field", action="store_const", const=WHOLE, default=NOISE, dest="of")
+    parser.add_argument("--speckles", action="store_const", const=SPECKLE, dest="of")
     options = parser.parse_args()
     here = str(Path(__file__).parent)  # where workers find FUNCTION
     os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
@@ -247,8 +273,7 @@ def main() -> None:
         Case.read("paper-real-twin"), options.folder, solution=shipped_solution("paper-real-twin")
     ).all()
     cases = grid({"name": options.name, "seed": 0}, seed=range(options.seeds))
-    function = WHOLE if options.whole_field else FUNCTION
-    campaign = Campaign(function, cases, options.folder.resolve())
+    campaign = Campaign(options.of, cases, options.folder.resolve())
     table = campaign.run(Workers(options.workers), lambda d, n, what: print(f"{d}/{n}", end="\r"))
     failed = int((table["error"] != "").sum())
     print(f"{len(table)} seeds of noise, {failed} failed; {options.name}")
