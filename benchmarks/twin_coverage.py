@@ -46,7 +46,8 @@ from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.validation.campaign import Campaign, grid
 from modeharvest.validation.workers import Workers
 
-NOISE, WHOLE, SPECKLE = (f"twin_coverage:{name}" for name in ("one_seed", "one_whole", "one_speckle"))
+NOISE, WHOLE = "twin_coverage:one_seed", "twin_coverage:one_whole"
+SPECKLE = "twin_coverage:one_speckle"
 EDGE_PX = 10
 SIZES = ["cutoff_px", "unknowns", "longest_px", "refit_px", "rms_px", "sd_px", "off_percent", "off"]
 INTERVAL = 1.96
@@ -217,7 +218,8 @@ class _CoverageSetup:
         """Another speckle and another noise on the same specimen, its masks found anew."""
         case, images = Case.read("paper-real-twin"), self.twin.images
         speckle, sensor = images.spec.speckle, images.spec.sensor
-        assert speckle.ink is not None and case.calibration is not None
+        assert speckle.ink is not None
+        assert case.calibration is not None
         speckle = replace(speckle, seed=1000 + seed, ink=replace(speckle.ink, seed=2000 + seed))
         sensor = replace(sensor, shot_seed=1000 + seed, read_seed=2000 + seed)
         case = case.model_copy(update={
@@ -264,7 +266,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("out/twin"))
     parser.add_argument("--name", default="deformed_1270")
-    parser.add_argument("--whole-field", action="store_const", const=WHOLE, default=NOISE, dest="of")
+    parser.set_defaults(of=NOISE)
+    parser.add_argument("--whole-field", action="store_const", const=WHOLE, dest="of")
     parser.add_argument("--speckles", action="store_const", const=SPECKLE, dest="of")
     options = parser.parse_args()
     here = str(Path(__file__).parent)  # where workers find FUNCTION

@@ -27,7 +27,7 @@ from modeharvest.idic.photograph.plain import displacement_of_plain, matched_con
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
-from modeharvest.imaging.photographs.contour import Contour, HoleShape, SeenContours
+from modeharvest.imaging.photographs.contour import Contour, Contours, HoleShape, SeenContours
 from modeharvest.imaging.photographs.files import read_image, read_mask, write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
@@ -103,9 +103,10 @@ def test_contours_do_not_depend_on_which_is_bright_nor_on_the_light() -> None:
     assert dark
     assert lit
     assert np.array_equal(plain.mask, dark.mask)
-    every = [Contour(points) for points in lit.contours]
+    every = [Contours((Contour(points),)) for points in lit.contours]
     for points in plain.contours:
-        off = min(np.abs(contour.distance(points)[0]).max() for contour in every)
+        alike = np.zeros(len(points), dtype=np.int64)
+        off = min(np.abs(contour.distance(points, alike)[0]).max() for contour in every)
         assert off < 0.05
 
 
@@ -114,21 +115,22 @@ def test_distance_from_a_circle_and_its_gradient() -> None:
     circle = Contour(np.stack([3.0 * np.cos(t), 3.0 * np.sin(t)], axis=1))
     x = np.random.default_rng(0).uniform(-5.0, 5.0, (100, 2))
     x = x[np.abs(np.linalg.norm(x, axis=1) - 3.0) < 1.5]
-    d, normal = circle.distance(x)
+    whole, number = Contours((circle,)), np.zeros(len(x), dtype=np.int64)
+    d, normal, _ = whole.distance(x, number)
     assert np.allclose(d, np.linalg.norm(x, axis=1) - 3.0, atol=1e-6)
     step = 1e-5 * np.eye(2)
-    slope = [(circle.distance(x + s)[0] - circle.distance(x - s)[0]) / 2e-5 for s in step]
-    assert np.allclose(np.stack(slope, axis=1), normal, atol=1e-5)
+    ahead, behind = ([whole.distance(x + k * s, number)[0] for s in step] for k in (1.0, -1.0))
+    slope = (np.array(ahead) - behind) / 2e-5
+    assert np.allclose(slope.T, normal, atol=1e-5)
 
 
 def test_a_curve_that_is_cut_has_no_distance_beyond_its_ends() -> None:
     t = np.linspace(0.0, np.pi, 100)
     half = Contour(np.stack([3.0 * np.cos(t), 3.0 * np.sin(t)], axis=1), closed=False)
     x = np.array([[0.5, 2.0], [-2.0, 2.9], [2.0, -1.5], [-3.2, -0.5]])
-    d, normal = half.distance(x)
+    d, _, beyond = Contours((half,)).distance(x, np.zeros(4, dtype=np.int64))
     assert np.allclose(d[:2], np.linalg.norm(x[:2], axis=1) - 3.0, atol=1e-6)
-    assert np.isnan(d[2:]).all()
-    assert not normal[2:].any()
+    assert beyond.tolist() == [False, False, True, True]
     points, step = half.evenly(0.5)
     assert np.allclose(points[[0, -1]], [[3.0, 0.0], [-3.0, 0.0]])
     assert np.allclose(np.linalg.norm(np.diff(points, axis=0), axis=1), step, rtol=1e-2)

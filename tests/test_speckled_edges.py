@@ -6,22 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from summary_schemas import faults
 from synthetic_photographs import Photographed, lattice_points
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.photograph.plain import away_from_cuts
 from modeharvest.idic.photograph.speckled_edges import edges_of_speckled
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.photographs.contour import Contour
+from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.photographs.pipeline import harvest
-from modeharvest.util.errors import InputError
 from modeharvest.validation.whole_field import v_percent, waves_percent
 
 pytest.importorskip("gmsh")
@@ -87,7 +89,30 @@ def test_contours_agree_with_the_speckle(folder: Path, tmp_path: Path) -> None:
     assert "by contours alone" in (tmp_path / "report.html").read_text("utf-8")
 
 
-def test_a_part_of_a_specimen_is_refused_in_a_line() -> None:
-    image, mask = PHOTOGRAPHED.image()[60:], PHOTOGRAPHED.mask[60:]
-    with pytest.raises(InputError, match="expected all of the specimen in the picture"):
-        edges_of_speckled(image, mask, PITCH / PIXEL)
+def test_of_a_part_in_view_the_pixels_away_from_its_border_are_compared(
+    folder: Path, tmp_path: Path
+) -> None:
+    rows, cols = np.s_[150:650], np.s_[110:540]
+    for path in folder.glob("*_8bit.tif"):
+        write_image(tmp_path / path.name, tifffile.imread(path)[rows, cols])
+    text = (folder / "experiment.toml").read_text("utf-8")
+    few = "[correlation]\nv0_degree = 3\nv_degree = 2\n"  # three by five cells show no more
+    (tmp_path / "experiment.toml").write_text(text + few)
+    summary = harvest(tmp_path / "experiment.toml", tmp_path / "out", contours=True)
+    (frame,) = summary["frames"]
+    name, beside = frame["name"], frame["contours"]
+    assert any("Not all of the specimen is in view" in text for text in beside["warnings"])
+    found, speckle = (
+        Result.read(tmp_path / f"out/contours/{name}{of}.json") for of in ("", "_speckle")
+    )
+    true = ImageSet.read(folder).truth(0.128).displacement[rows, cols]
+    inner = away_from_cuts(np.isfinite(true).all(axis=-1), found.grid, PITCH)
+    assert speckle.pixels < inner.sum() < 0.7 * frame["pixels"]
+    best = fit_displacement(true, found.grid, found.ansatz, found.unknowns, inner)
+    off = [np.linalg.norm((r.displacement() - best.displacement())[inner], axis=-1).mean()
+           for r in (found, speckle)]  # fmt: skip
+    assert off[0] < min(0.3 * FINER, off[1])
+    assert waves_percent(found, best) < 0.3
+    waves = [row["difference_sd"] for row in beside["compared"] if "wave" in row["what"]]
+    assert np.abs(waves).max() < 2.0
+    assert abs(beside["pattern_ratio"] - 1.0) < 0.06

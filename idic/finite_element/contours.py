@@ -57,6 +57,8 @@ _FAR_PX = 3.0
 """The mesh's edge is off the contour of the reference by less, or that contour is not known."""
 _CUT_PX = 5.0
 """Sides of elements nearer to the image's border are cut by it: masks are rounded off there."""
+_TURNED = 0.3
+"""Cosine of the angle between an edge's normals in both images, at least."""
 _MOST_SIDES = 4
 """Of elements in one piece of a cut, whose tractions have two resultants and a moment."""
 _RIDGE = 3.0
@@ -102,14 +104,15 @@ class _Edge:
         number = np.repeat(np.arange(len(seen.reference)), [len(c.points) for c in seen.reference])
         self.number = number[cKDTree(every).query(self.points)[1]]
         self.deformed = Contours(seen.deformed)
-        off, _ = Contours(seen.reference).distance(self.points, self.number)
-        self.off: FloatArray = np.nan_to_num(off)
-        is_part = not all(contour.closed for contour in seen.reference)
-        self.cut = np.where(is_part, _cut_ligaments(mesh, sides, grid), -1).repeat(t.size)
+        self.off, self.normal, beyond = Contours(seen.reference).distance(self.points, self.number)
+        self.off[beyond] = 0.0
+        self.cut = np.where(seen.is_part, _cut_ligaments(mesh, sides, grid), -1).repeat(t.size)
         """(q,) number of the ligament that the image's border cuts, from 0; -1 elsewhere."""
         self.whole_length = self.length.copy()
-        self.is_tied = (np.abs(off) < _FAR_PX * pixel_size) & (self.cut < 0)
+        self.is_tied = (np.abs(self.off) < _FAR_PX * pixel_size) & (self.cut < 0)
         """(q,) whether a point of the edge is held."""
+        self.has_left = np.zeros(len(self.points), dtype=np.bool_)
+        """(q,) whether it isn't on its contour in the deformed image any more: see :meth:`look`."""
         dots = np.array([[c.moments[1] for c in pair] for pair in seen.dots]).reshape(-1, 2, 2)
         half = np.array([0.5 * contour.length for contour, _ in seen.dots])
         self.length = np.append(np.where(self.is_tied, self.length, 0.0), half.repeat(2))
@@ -147,16 +150,28 @@ class _Edge:
             other[at] /= np.sqrt(np.maximum(square, _TINY))  # of size 1, as the forces
         return own, other
 
+    def look(self, u: FloatArray) -> None:
+        """See which points have left the image at displacements (n, 2).
+
+        They are beyond the end of a contour that is cut, or nearest to a part that goes elsewhere.
+        """
+        x, is_cut = self.points + self.shapes @ u, self.deformed.is_cut[self.number]
+        _, normal, beyond = self.deformed.distance(x, self.number)
+        turned = (normal * self.normal).sum(axis=1) < _TURNED
+        self.has_left = beyond | (is_cut & turned)
+
     def distances(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(q + 2 p,) signed distances [mm] at displacements (n, 2), (q + 2 p, 2) their gradients.
 
-        Both are 0 where a point has left the image.
+        Both are 0 where a point had left the image: from iteration to iteration energies would jump
+        if that changed.
         """
-        d, normal = self.deformed.distance(self.points + self.shapes @ u, self.number)
-        d -= self.off
+        d, normal, _ = self.deformed.distance(self.points + self.shapes @ u, self.number)
+        d = np.where(self.has_left, 0.0, d - self.off)
+        normal[self.has_left] = 0.0
         off = self.at_dots @ u - self.dots_moved
         along = np.tile(np.eye(2), (len(off), 1))
-        return np.append(np.nan_to_num(d), off.ravel()), np.vstack([normal, along])
+        return np.append(d, off.ravel()), np.vstack([normal, along])
 
     def normal_shapes(self, normal: FloatArray) -> csr_array:
         """(q + 2 p, 2 n) what displacements are along the normals (q + 2 p, 2)."""
@@ -172,12 +187,13 @@ def _cut_ligaments(mesh: Mesh, sides: IntArray, grid: PixelGrid) -> IntArray:
     """(s,) which cut of a ligament each side (s, 3) of the mesh's edge is part of; -1 of none."""
     left, right, bottom, top = grid.extent
     x, y = mesh.nodes[sides[:, 1]].T
-    from_border = np.min([x - left, right - x, y - bottom, top - y], axis=0)
-    near = from_border < _CUT_PX * grid.pixel_size
+    from_borders = np.array([x - left, right - x, y - bottom, top - y])
+    near = from_borders.min(axis=0) < _CUT_PX * grid.pixel_size
     own, size = sides[near], len(mesh.nodes)
     joined = csr_array((np.ones(len(own)), (own[:, 0], own[:, 2])), shape=(size, size))
     _, of_node = connected_components(joined, directed=False)
-    key, number = of_node[own[:, 0]] * len(sides), np.full(len(sides), -1)
+    which = 4 * of_node[own[:, 0]] + from_borders[:, near].argmin(axis=0)
+    key, number = which * len(sides), np.full(len(sides), -1)
     for k in np.unique(key):  # cut lengthwise, in pieces
         x = mesh.nodes[own[key == k, 1]]
         along = (x - x.mean(axis=0)) @ np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2][0]
@@ -289,6 +305,7 @@ class _PenalisedBody:
     def relax(self, springs: float, tolerance_px: float) -> bool:
         """Newton's method, safeguarded as Levenberg's; springs in mu/px. Whether it converged."""
         self.stiffness = springs / self.px
+        self.edge.look(self.u.reshape(-1, 2))
         energy, damping, safe = self.energy(self.u), 1e-3, self._first / self.shear
         for _ in range(_STEPS):
             A, _, forces = self.linearised()

@@ -35,7 +35,7 @@ from modeharvest.imaging.photographs.contour import Contour, HoleShape, SeenCont
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import write_csv
-from modeharvest.util.masks import large_parts, shrunk
+from modeharvest.util.masks import grown, large_parts, shrunk
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.typed import picked
 
@@ -79,7 +79,7 @@ _CONTOURS = (
     "No speckle: the displacement is that of a hyperelastic body held to its contours, and the "
     "ansatz is fitted to it."
 )
-_CUT = (
+CUT = (
     "Not all of the specimen is in view: what holds it where the picture cuts it isn't known, so "
     "that nothing is said within a hole's distance of there."
 )
@@ -113,6 +113,12 @@ class PlainSurface:
     dots: tuple[FloatArray, ...] = ()
     """(n, 2) points (row, col) [px] around marks on the material, which belong to it."""
 
+    @property
+    def is_part(self) -> bool:
+        """Whether the picture's border cuts the specimen, or all of it is material."""
+        around = self.mask[[0, -1]].all() and self.mask[:, [0, -1]].all()
+        return bool(self.cut) or bool(around)
+
     def on(self, grid: PixelGrid) -> tuple[list[Contour], ...]:
         """Outer contours, those of holes, of cuts, and of dots, in a grid's frame [mm]."""
         kinds = (self.contours, True), (self.cut, False), (self.dots, True)
@@ -120,7 +126,7 @@ class PlainSurface:
             [Contour(np.column_stack(grid.to_mm(*points.T)), whole) for points in part]
             for part, whole in kinds
         )
-        outer = 0 if cut else 1
+        outer = 0 if self.is_part else 1
         return closed[:outer], closed[outer:], cut, dots
 
 
@@ -142,13 +148,14 @@ def plain_surface(
     material = large_parts(bright if _is_material(bright) else ~bright, _LEAST_PX2)
     if not material.any() or _shows_speckle(image, material, step):
         return None
-    material, text = _one_specimen(material | ~large_parts(~material, _LEAST_PX2), like)
+    material = material | ~large_parts(~material, _LEAST_PX2)
+    material, text = one_specimen(material, like, "crop the pictures to measure another one")
     contours, cut = contours_around(grey - middle, material)
     if not contours:
         return None
-    if cut:
-        text += (_CUT,)
-    contours, dots, most = _without_dots(contours, 0 if cut else 1, dot_px2)
+    if is_part := PlainSurface(material, (), 0.0, cut=cut).is_part:
+        text += (CUT,)
+    contours, dots, most = _without_dots(contours, 0 if is_part else 1, dot_px2)
     if dots:
         text += (_DOTS.format(len(dots)),)
     slope = _slope(grey, contours + cut)
@@ -231,17 +238,23 @@ def contours_around(
     return tuple(sorted(closed, key=lambda points: -abs(signed_area(points)))), tuple(cut)
 
 
-def _one_specimen(material: BoolArray, like: BoolArray | None) -> tuple[BoolArray, tuple[str, ...]]:
-    """The largest island, or the one where ``like`` is True; what there is besides."""
-    islands, _ = label(material)
-    sizes = np.bincount(islands.ravel())[1:]
-    at = sizes if like is None else np.bincount(islands[like], minlength=len(sizes) + 1)[1:]
-    mine, count = int(np.argmax(at)), int((sizes >= _SECOND * sizes.max()).sum())
+def one_specimen(
+    material: BoolArray, like: BoolArray | None, of_another: str, apart_px: float = 0.0
+) -> tuple[BoolArray, tuple[str, ...]]:
+    """The largest island, or the one where ``like`` is True; whether there are other specimens.
+
+    ``of_another``: what to do to measure another one; islands less than twice ``apart_px`` apart
+    are one.
+    """
+    islands, count = label(grown(material, apart_px) if apart_px else material)
+    sizes = np.bincount(islands[material], minlength=count + 1)[1:]
+    at = sizes if like is None else np.bincount(islands[like], minlength=count + 1)[1:]
+    mine, large = int(np.argmax(at)), int((sizes >= _SECOND * sizes.max()).sum())
     text = (
-        f"There are {count} specimens in the picture; the one of {sizes[mine]} px was measured: "
-        "crop the pictures to measure another one."
+        f"There are {large} specimens in the picture; the one of {sizes[mine]} px was measured: "
+        f"{of_another}."
     )
-    return np.asarray(islands == 1 + mine), (text,) * (count > 1)
+    return np.asarray(material & (islands == 1 + mine)), (text,) * (large > 1)
 
 
 def _inside(material: BoolArray) -> BoolArray:
@@ -352,7 +365,7 @@ def matched_contours(
     noise = (reference.noise + deformed.noise) * grid.pixel_size**3
     sides = tuple(c for c, _ in every), tuple(c for _, c in every)
     seen = SeenContours(*sides, noise, _CORRELATED_PX * grid.pixel_size,
-                        _paired_dots(dots, dots_g, affine))  # fmt: skip
+                        _paired_dots(dots, dots_g, affine), reference.is_part)  # fmt: skip
     lost = len(left) - sum(any(c is hole for hole in left) for c, _ in arcs)
     return MatchedContours(seen, affine, found, lost)
 
@@ -449,9 +462,8 @@ def displacement_of_plain(
 ) -> tuple[NodalResult, MatchedContours]:
     """The displacement in another picture (rows, cols) of a plain specimen, and its contours.
 
-    ``body``: a mesh of the reference's material; ``before``: (n, 2) displacement of its nodes [mm]
-    in the picture before, which the iteration begins from, by default an affine motion. InputError,
-    in which the picture has a name, if it shows no plain specimen, or another one.
+    For the rest see :func:`displacement_between`. InputError, in which the picture has a name, if
+    it shows no plain specimen, or another one.
     """
     dot_px2 = max((abs(signed_area(points)) for points in reference.dots), default=0.0)
     deformed = plain_surface(image, reference.mask, _DOT_GROWS * dot_px2)
@@ -460,15 +472,32 @@ def displacement_of_plain(
             f"expected two grey levels in {name}, like the reference's, got more: a plain specimen "
             "can't be found there; light it evenly, or give a mask if it has speckle"
         )
+    return displacement_between(reference, deformed, grid, body, progress, before)
+
+
+def displacement_between(
+    reference: PlainSurface, deformed: PlainSurface, grid: PixelGrid, body: Body,
+    progress: Progress = silent, before: FloatArray | None = None,
+) -> tuple[NodalResult, MatchedContours]:  # fmt: skip
+    """The displacement between two pictures of which the contours are known, and these.
+
+    Where the reference shows a part only, of what is farther than a cell from the picture's border.
+
+    body : a mesh of the reference's material.
+    before : (n, 2) displacement of its nodes [mm] in the picture before, which the iteration begins
+        from, by default an affine motion.
+
+    InputError if the contours don't belong together, or don't hold the body.
+    """
     matched = matched_contours(reference, deformed, grid)
     found = _after(matched, body, grid, before, progress)
-    if reference.cut:
+    if reference.is_part:
         centres = np.array([hole.moments[1] for hole, _ in matched.holes])
         found = _away_from_cuts(found, reference.mask, _spacing(centres))
     if matched.lost:
         lost = f"{matched.lost} holes weren't found again: what is around them follows from a law."
         found = replace(found, warnings=(*found.warnings, lost))
-    if deformed.cut and not reference.cut:
+    if deformed.is_part and not reference.is_part:
         found = replace(found, warnings=(*found.warnings, _LEFT))
     return found, matched
 
@@ -489,23 +518,31 @@ def _after(
     return found
 
 
-def from_cuts(mask: BoolArray) -> FloatArray:
-    """(rows, cols) distance from where the picture's border cuts the material (rows, cols) [px]."""
-    border = np.zeros_like(mask)
-    border[[0, -1]] = border[:, [0, -1]] = True
-    return np.asarray(distance_transform_edt(~(mask & border)))
+def away_from_cuts(mask: BoolArray, grid: PixelGrid, cell_size: float) -> BoolArray:
+    """(rows, cols) where a material is farther than a cell [mm] from where the border cuts it."""
+    return np.asarray(mask & (_from_cuts(mask) * grid.pixel_size > cell_size))
+
+
+def _from_cuts(mask: BoolArray) -> FloatArray:
+    """(rows, cols) distance from where the picture's border cuts a material (rows, cols) [px].
+
+    Infinite if it doesn't.
+    """
+    cut = np.zeros_like(mask)
+    cut[[0, -1]], cut[:, [0, -1]] = mask[[0, -1]], mask[:, [0, -1]]
+    return np.asarray(distance_transform_edt(~cut) if cut.any() else np.full(mask.shape, np.inf))
 
 
 def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
     """What is farther than so much [mm] from where a picture cuts the material (rows, cols)."""
-    mesh, distance = found.mesh, from_cuts(mask) * found.grid.pixel_size
+    mesh, distance = found.mesh, _from_cuts(mask) * found.grid.pixel_size
     at = np.rint(found.grid.to_px(*mesh.nodes.T)).astype(np.int64).T
     row, col = np.clip(at, 0, np.array(mask.shape) - 1).T
     far = distance[row, col] > reach
     cells = mesh.cells[far[mesh.cells].all(axis=1)]
     if not cells.size:
         raise InputError(
-            "expected a specimen without speckle of which more is in view than a cell beside the "
+            "contours: expected a specimen of which more is in view than a cell beside the "
             "picture's border, got less; take it from farther away"
         )
     kept = np.unique(cells)

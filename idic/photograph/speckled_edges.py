@@ -18,18 +18,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates
 
-from modeharvest.idic.finite_element.contours import displacement_from_contours
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import refitted
 from modeharvest.idic.finite_element.system import SAMPLES, Body
-from modeharvest.idic.photograph.plain import PlainSurface, contours_around, matched_contours
+from modeharvest.idic.photograph.plain import (
+    CUT,
+    PlainSurface,
+    contours_around,
+    displacement_between,
+)
 from modeharvest.idic.result import Covariance, Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.imaging.photographs.contour import Contour
+from modeharvest.imaging.photographs.contour import Contour, signed_area
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
-from modeharvest.util.masks import grown, shrunk
+from modeharvest.util.masks import grown, opened, shrunk
 from modeharvest.util.progress import Progress, silent
 
 ELEMENTS_A_CELL = 5
@@ -60,44 +64,56 @@ class ByContours:
     result: Result
     """With ``errors``: by the contours' noise, and by all that they leave open, as for a specimen
     without speckle: its law, whether it slides on plates, springs."""
+    speckle: Result
+    """The same by the speckle; of a part in view by that of the same pixels."""
     edge_sd_px: float
     """Standard deviation of an edge's displacement, averaged along 10 px [px]."""
 
 
 def body_for_edges(mask: BoolArray, grid: PixelGrid, cell_px: float) -> Body:
-    """A mesh of the material whose edges are as long as contours can tell."""
+    """A mesh of the material whose edges are as long as contours can tell.
+
+    Without what is narrower than them between a hole and the picture's border: it would make all
+    elements as small.
+    """
     edge = max(4.0, cell_px / ELEMENTS_A_CELL)
-    return FiniteElementOptions(2.0 * edge, edge).body(mask, grid)
+    slim = mask & ~opened(mask, 0.5 * edge, at_border=True)
+    inner = slice(round(edge), -round(edge))
+    slim[inner, inner] = False
+    return FiniteElementOptions(2.0 * edge, edge).body(mask & ~slim, grid)
 
 
 def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> PlainSurface:
     """Contours (row, col) of a speckled material in an image (rows, cols); ``mask``: about where.
 
     Their noise is what one of two photographs of the same speckle adds to a displacement's.
-    InputError if the material reaches the border of the image, or shows no edges.
+    Those of a part in view end at the image's border. InputError if the material shows no edges.
     """
-    if mask[[0, -1]].any() or mask[:, [0, -1]].any():
-        raise InputError("contours: expected all of the specimen in the picture, got a part of it")
     share, weight = _share_of_material(np.asarray(image, np.float32), mask)
-    found, _ = contours_around(share - 0.5, mask)
-    areas = [abs(Contour(points).moments[0]) for points in found]
-    least = _LEAST_HOLE * float(np.median(areas[1:])) if len(areas) > 1 else 0.0
-    width = _SMOOTHED * max(4.0, cell_px / ELEMENTS_A_CELL)
-    kept = [p for p, area in zip(found, areas, strict=True) if area >= least]
+    found, cut = contours_around(share - 0.5, mask)
+    areas = [abs(signed_area(points)) for points in found]
+    seen = PlainSurface(mask, (), 0.0, cut=cut)
+    holes = areas if seen.is_part else areas[1:]
+    least = _LEAST_HOLE * float(np.median(holes)) if holes else 0.0
+    kept = [Contour(p) for p, area in zip(found, areas, strict=True) if area >= least]
+    ends = [Contour(points, False) for points in cut]
     if not kept:
         raise InputError("contours: expected edges of the material in the picture, got none")
-    contours = tuple(_smoothed(points, weight, width)[0] for points in kept)
-    return PlainSurface(mask, contours, (1.0 - _COMMON) * _roughness(kept, weight, cell_px))
+    width = _SMOOTHED * max(4.0, cell_px / ELEMENTS_A_CELL)
+    contours, arcs = ([_smoothed(c, weight, width)[0] for c in part] for part in (kept, ends))
+    noise = (1.0 - _COMMON) * _roughness(kept, weight, cell_px)
+    return replace(seen, contours=(*contours,), noise=noise, cut=(*arcs,),
+                   warnings=(CUT,) if seen.is_part else ())  # fmt: skip
 
 
-def _roughness(contours: Sequence[FloatArray], weight: FloatArray, cell_px: float) -> float:
+def _roughness(contours: Sequence[Contour], weight: FloatArray, cell_px: float) -> float:
     """Variance of contours' distances by speckle, times the length over which they are correlated.
 
     That of means over neighbouring lengths (D. W. Allan's), which shapes hardly add to [px^3].
     """
     squares = []
-    for points in contours:
-        smooth, off, step = _smoothed(points, weight, _CURVED * cell_px)
+    for contour in contours:
+        smooth, off, step = _smoothed(contour, weight, _CURVED * cell_px)
         along = np.gradient(smooth, axis=0)
         across = np.stack([along[:, 1], -along[:, 0]], axis=1)
         distance = (off * across).sum(axis=1) / np.linalg.norm(across, axis=1)
@@ -138,21 +154,21 @@ def _mean_over(grey: FloatImage, region: BoolArray, width: float) -> FloatImage:
 
 
 def _smoothed(
-    points: FloatArray, weight: FloatArray, width: float
+    curve: Contour, weight: FloatArray, width: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """A contour (n, 2) as parabolas fitted along it, what they leave of it, and its step [px].
+    """(n, 2) parabolas fitted along a contour, what they leave of it, and the points' step [px].
 
-    Their weights are Gaussian, of a width [px], times the image's.
+    Their weights are Gaussian, of a width [px], times the image's; beyond a contour's end none.
     """
-    curve = Contour(points)
     x, step = curve.evenly(_STEP_PX)
     w = map_coordinates(weight, x.T, order=1, mode="nearest")
     reach = int(min(4.0 * width / step, (len(x) - 1) // 2))
     t = np.arange(-reach, reach + 1) * (step / width)
     window = np.exp(-0.5 * t**2)
     around = [(window * t**k)[::-1] for k in range(5)]
-    moments = np.stack([convolve1d(w, part, mode="wrap") for part in around])
-    right = [convolve1d(w[:, None] * x, part, axis=0, mode="wrap") for part in around[:3]]
+    mode = "wrap" if curve.closed else "constant"
+    moments = np.stack([convolve1d(w, part, mode=mode) for part in around])
+    right = [convolve1d(w[:, None] * x, part, axis=0, mode=mode) for part in around[:3]]
     A = np.stack([moments[k : k + 3] for k in range(3)]).transpose(2, 0, 1)
     smooth = np.linalg.solve(A, np.stack(right, axis=1))[:, 0]
     return smooth, x - smooth, step
@@ -162,24 +178,26 @@ def measure_by_contours(
     reference: PlainSurface, pair: ImagePair, speckle: Result, cell_size: float, body: Body,
     progress: Progress = silent,
 ) -> ByContours:  # fmt: skip
-    """Measure a result's ansatz by contours alone; the result is where the fit starts.
+    """Measure a result's ansatz by contours alone; the result is where iterations start.
 
     reference : its contours, by :func:`edges_of_speckled`.
     pair : the photographs with both masks of the material.
     body : by :func:`body_for_edges`, of the reference's mask.
 
+    Of a part in view the fit is that of what is farther than a cell from the picture's border.
     InputError if the contours don't belong together, or can't be found.
     """
     grid, (mask, there) = pair.grid, pair.masks
     deformed = edges_of_speckled(pair.deformed, there, cell_size / grid.pixel_size)
     # A buckled hole's ends are too sharp to tell roughness from shape: the speckle is the same.
-    matched = matched_contours(reference, replace(deformed, noise=reference.noise), grid)
-    start = matched.start(body.mesh.nodes)
-    measured = displacement_from_contours(matched.seen, body, grid, start, progress=progress)
+    deformed = replace(deformed, noise=reference.noise)
+    begin = speckle.ansatz.displacement_at(speckle.unknowns, body.mesh.nodes)
+    measured, _ = displacement_between(reference, deformed, grid, body, progress, begin)
     fit = refitted(measured, speckle.ansatz, speckle.unknowns, mask)
     assert measured.roots is not None
     by_noise = replace(measured, roots=measured.roots[..., :SAMPLES])
     result = refitted(by_noise, fit.ansatz, fit.unknowns, mask)
-    errors = Covariance(result.covariance(), fit.covariance(), measured.warnings)
+    warnings = *reference.warnings, *measured.warnings
+    errors = Covariance(result.covariance(), fit.covariance(), warnings)
     edge_sd = float(np.sqrt(2.0 * reference.noise / _SHOWN_PX))
-    return ByContours(replace(result, errors=errors), edge_sd)
+    return ByContours(replace(result, errors=errors), speckle, edge_sd)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 
 _FINE_PX = 0.25
 """Between the points of a contour among which the nearest is sought."""
@@ -61,17 +61,6 @@ class Contour:
         count = int(self.length / step)
         return np.linspace(0.0, self.length, count, endpoint=not self.closed, dtype=np.float64)
 
-    def distance(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) signed distance of points (n, 2) from the curve [mm], and (n, 2) its gradient.
-
-        NaN and 0 beyond the ends of a curve that is cut.
-        """
-        return self._alone.distance(x, np.zeros(len(x), dtype=np.int64))
-
-    @cached_property
-    def _alone(self) -> Contours:
-        return Contours((self,))
-
 
 class Contours:
     """Several contours, from one of which each point's distance is asked for: all at once."""
@@ -103,10 +92,11 @@ class Contours:
         (a, b, c, d), t = self._coefficients[:, piece], (at - self._knots[piece])[:, None]
         return ((a * t + b) * t + c) * t + d, (3.0 * a * t + 2.0 * b) * t + c, 6.0 * a * t + 2.0 * b
 
-    def distance(self, x: FloatArray, number: IntArray) -> tuple[FloatArray, FloatArray]:
+    def distance(self, x: FloatArray, number: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """(n,) signed distance of points (n, 2) from their contours [mm], (n, 2) its gradient.
 
-        ``number`` (n,): of each point's contour. NaN and 0 beyond the ends of one that is cut.
+        Where the third, (n,), is True that from the tangent beyond the end of one that is cut.
+        ``number`` (n,): of each point's contour.
         """
         s = self._fine[self._tree.query(self._separated(x, number))[1]]
         step, length, is_cut = self.step[number], self.length[number], self.is_cut[number]
@@ -121,9 +111,7 @@ class Contours:
         along, off = along / np.linalg.norm(along, axis=1, keepdims=True), x - there
         normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
         d = (off * normal).sum(axis=1)
-        beyond = is_cut & (np.abs((off * along).sum(axis=1)) > step)
-        d[beyond], normal[beyond] = np.nan, 0.0
-        return d, normal
+        return d, normal, is_cut & (np.abs((off * along).sum(axis=1)) > step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +127,8 @@ class SeenContours:
     """That length [mm]."""
     dots: tuple[tuple[Contour, Contour], ...] = ()
     """Around marks on the material, in the reference and in the deformed image [mm]."""
+    is_part: bool = False
+    """Whether the reference's border cuts the body."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import correlate
 from modeharvest.idic.finite_element.files import Given, read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.pixels import continued
@@ -44,7 +45,7 @@ from modeharvest.idic.photograph.measure import (
 )
 from modeharvest.idic.photograph.plain import (
     PlainSurface,
-    from_cuts,
+    away_from_cuts,
     measure_contours,
     plain_surface,
     write_shapes,
@@ -59,7 +60,7 @@ from modeharvest.idic.result import Covariance, Result
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum
-from modeharvest.idic.uncertainty.covariance import covariance, field_errors
+from modeharvest.idic.uncertainty.covariance import covariance
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
@@ -74,6 +75,7 @@ from modeharvest.runs.photographs.results import (
     HarvestTruth,
     PartSpectrum,
     amplitude_of,
+    error_fields,
     frame_numbers,
     harvest_summary,
     shown_moments,
@@ -92,6 +94,8 @@ _EDGE_PX = 2
 """A camera's pixels on an edge show some background, and taking out distortion mixes it further."""
 _ALONG = 120
 """Points of the error bars along the longer side: they are as smooth as the ansatz."""
+_BOTH = "", "_speckle"
+"""Ends of the names of what contours show, and of what speckle shows there."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +140,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         """Holes, lattice and cellular part, from the reference."""
         prepared, table = self.prepared, self.case.specimen
         mask = prepared.mask()
-        if self._plain and self._plain.cut:  # within a cell of there nothing is measured
-            mask = mask & (from_cuts(mask) * prepared.grid.pixel_size > table.cell_size)
+        if self._plain and self._plain.is_part:  # within a cell of there nothing is measured
+            mask = away_from_cuts(mask, prepared.grid, table.cell_size)
         return find_geometry(mask, prepared.grid, table, self.case.base)
 
     def results(self) -> Mapping[str, MeasuredPhotograph]:
@@ -282,17 +286,29 @@ class HarvestRun(StagedRun[PhotographCase]):
             return edges, body_for_edges(mask, grid, cell_px)
 
         def work(name: str, _: object) -> tuple[Sequence[Path], dict[str, Any]]:
-            (edges, body), path = reference(), folder / f"{name}.json"
+            (edges, body), paths = reference(), [folder / f"{name}{of}.json" for of in _BOTH]
             pair, speckle = self.prepared.pair(name), self.results()[name].result
             found = measure_by_contours(edges, pair, speckle, cell.cell_size, body, self.progress)
-            found.result.write(path)
-            return (path,), picked(found, "edge_sd_px")
+            if edges.is_part:  # w, which the ansatz can't describe, has other fits on other pixels
+                mask = away_from_cuts(pair.masks[0], grid, cell.cell_size)
+                speckle = self._correlated_again(replace(pair, mask=mask), speckle)
+            for path, result in zip(paths, (found.result, speckle), strict=True):
+                result.write(path)
+            return paths, picked(found, "edge_sd_px")
 
         def read(name: str, about: dict[str, Any]) -> ByContours:
-            return ByContours(Result.read(folder / f"{name}.json"), about["edge_sd_px"])
+            found, speckle = (Result.read(folder / f"{name}{of}.json") for of in _BOTH)
+            return ByContours(found, speckle, about["edge_sd_px"])
 
         keys = {name: digest(["contours", self._keys[name]]) for name in self.results()}
         return self.do_in_turn("contours", keys, folder, work, read)
+
+    def _correlated_again(self, pair: ImagePair, known: Result) -> Result:
+        """A result's ansatz on other pixels of the reference, from there on, with errors."""
+        how, a, progress = self.case.correlation.options(), known.unknowns, self.progress
+        how = replace(how, levels=how.levels[-1:])
+        found = correlate(pair, known.ansatz, guess=a, options=how, progress=progress)
+        return replace(found, errors=self._covariance(found, pair))
 
     @cached_property
     def _plain(self) -> PlainSurface | None:
@@ -370,6 +386,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             test = residual_test(result, pair, noise, case.correlation.edge_px)
         found = result.errors
         assert found is not None
+        by_noise, by_model_error = error_fields(result, x, y)
         along, across = mean_strain(result, box)
         spectrum = measured_spectrum(measured.local, cell, box)
         pattern = read_pattern(spectrum)
@@ -383,9 +400,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
             mask=pair.deformed_mask, result=result,
             identifiability=identifiability(result, pair.mask), residual_test=test, error_x=x,
-            error_y=y, by_noise=field_errors(result, x, y, found.by_noise),
-            by_model_error=None if found.by_model_error is None
-            else field_errors(result, x, y, found.by_model_error),
+            error_y=y, by_noise=by_noise, by_model_error=by_model_error,
             spectrum=spectrum, pattern=pattern,
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()), w=w,
             whole=measured.whole, contours=beside.get(name), rigid=self.prepared.rigid.get(name),
@@ -395,12 +410,15 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     def _errors(self, name: str, measured: MeasuredPhotograph) -> Covariance:
         """Of a photograph's unknowns, by its noise and by model error."""
-        result, case = measured.result, self.case
+        result = measured.result
         if self._plain is not None and measured.whole:
             return Covariance(result.covariance(), measured.whole.refit.covariance())
-        pair = self.prepared.pair(name)
-        noise, edge_px = image_noise(pair, self.prepared.noise), case.correlation.edge_px
-        return covariance(result, pair, noise, case.specimen.cell_size, edge_px)
+        return self._covariance(result, self.prepared.pair(name))
+
+    def _covariance(self, result: Result, pair: ImagePair) -> Covariance:
+        """Of what was correlated."""
+        case, noise = self.case, image_noise(pair, self.prepared.noise)
+        return covariance(result, pair, noise, case.specimen.cell_size, case.correlation.edge_px)
 
     def _pair(self, name: str, last: tuple[str, MeasuredPhotograph] | None) -> ImagePair:
         """The photograph and what it is correlated with."""

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import label
 
 from modeharvest.idic.local.field import LocalField, read_field, without_distortion
 from modeharvest.idic.local.formats import frames_of
@@ -21,7 +20,7 @@ from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.idic.photograph.matching import RigidMotion, rigid_motion
 from modeharvest.idic.photograph.material import find_material, window_for
-from modeharvest.idic.photograph.plain import plain_surface
+from modeharvest.idic.photograph.plain import one_specimen, plain_surface
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial, calibrate
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
@@ -52,7 +51,6 @@ from modeharvest.runs.photographs.sequence import chosen_frames, named_files
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError, WriteError
 from modeharvest.util.files import read_json, reading, write_json
-from modeharvest.util.masks import grown
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import made, picked, to_plain
 
@@ -349,10 +347,6 @@ def _require_alike(reference: ShownMaterial, deformed: ShownMaterial, path: Path
         )
 
 
-_SECOND = 0.2
-"""Of the largest connected part of the material: from this size on another one is a specimen."""
-
-
 def _one_specimen(
     shown: ShownMaterial, cell_px: float, like: ShownMaterial | None = None
 ) -> ShownMaterial:
@@ -360,19 +354,12 @@ def _one_specimen(
 
     What is less than half a cell apart is one.
     """
+    where, of_another = like.mask if like else None, "give a mask of another one as material"
     for apart_px in (0.0, 0.25 * cell_px):  # the first is quick
-        parts, count = label(grown(shown.mask, apart_px) if apart_px else shown.mask)
-        sizes = np.bincount(parts[shown.mask], minlength=count + 1)[1:]
-        if count < 2 or np.sort(sizes)[-2] < _SECOND * sizes.max():
+        mask, text = one_specimen(shown.mask, where, of_another, apart_px)
+        if not text:
             return shown
-    mine = sizes if like is None else np.bincount(parts[like.mask], minlength=count + 1)[1:]
-    chosen = 1 + int(np.argmax(mine))
-    number = int((sizes >= _SECOND * sizes.max()).sum())
-    text = (
-        f"There are {number} specimens in the picture; the one of {sizes[chosen - 1]} px was "
-        "measured: give a mask of another one as material."
-    )
-    return replace(shown, mask=shown.mask & (parts == chosen), warnings=(text,))
+    return replace(shown, mask=mask, warnings=text)
 
 
 _LIGHT = 0.03

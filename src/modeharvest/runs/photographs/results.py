@@ -19,6 +19,7 @@ from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.holes import HoleLattice
 from modeharvest.idic.photograph.matching import RigidMotion
+from modeharvest.idic.photograph.plain import away_from_cuts
 from modeharvest.idic.photograph.speckled_edges import ByContours
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.noise import CameraNoise
@@ -176,6 +177,15 @@ class Harvest:
         return self.case.specimen.cell_size
 
 
+def error_fields(
+    result: Result, x: FloatArray, y: FloatArray
+) -> tuple[FieldErrors, FieldErrors | None]:
+    """Error bars of a result on axes [mm], by noise and by model error if that is known."""
+    assert result.errors is not None
+    noise, model = field_errors(result, x, y, result.errors.by_noise), result.errors.by_model_error
+    return noise, None if model is None else field_errors(result, x, y, model)
+
+
 def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
     """A frame's place on the time line."""
     identified, noise = frame.identifiability, rms_errors(frame, frame.by_noise, cellular)
@@ -266,11 +276,15 @@ def _wave_vectors(harvest: Harvest, frame: HarvestedFrame, i: int) -> list[dict[
     return found
 
 
+def _few_pixels(harvest: Harvest) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Axes of every few pixels [mm], and which of these are material."""
+    grid, step = harvest.grid, max(1, round(max(harvest.grid.shape) / _CELLS))
+    return grid.x[::step], grid.y[::step], harvest.mask[::step, ::step]
+
+
 def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
     """The largest |v| and the largest length of v phi on the material of the mode's own part."""
-    grid, box = harvest.grid, frame.result.ansatz.modes[i].taper.cellular
-    step = max(1, round(max(grid.shape) / _CELLS))
-    x, y, mask = grid.x[::step], grid.y[::step], harvest.mask[::step, ::step]
+    (x, y, mask), box = _few_pixels(harvest), frame.result.ansatz.modes[i].taper.cellular
     inside = mask & ((box.y_min <= y) & (y <= box.y_max))[:, None]
     inside &= ((box.x_min <= x) & (x <= box.x_max))[None, :]
     ansatz, a = frame.result.ansatz, frame.result.unknowns
@@ -280,7 +294,7 @@ def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str
     at = np.abs(frame.error_y - y[row]).argmin(), np.abs(frame.error_x - x[col]).argmin()
     by_model_error = frame.by_model_error
     return {
-        "largest_px": float(length.max(initial=0.0, where=inside)) / grid.pixel_size,
+        "largest_px": float(length.max(initial=0.0, where=inside)) / harvest.grid.pixel_size,
         "v_max_mm": v[row, col],
         "v_max_sd_noise_mm": frame.by_noise.v[i][at],
         "v_max_sd_model_error_mm": None if by_model_error is None else by_model_error.v[i][at],
@@ -381,16 +395,14 @@ def _contours(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
     found = frame.contours
     if found is None:
         return None
-    result, x, y, errors = found.result, frame.error_x, frame.error_y, found.result.errors
-    assert errors
-    assert errors.by_model_error is not None
-    by_contours = replace(
-        frame, result=result, by_noise=field_errors(result, x, y, errors.by_noise),
-        by_model_error=field_errors(result, x, y, errors.by_model_error),
-    )  # fmt: skip
-    compared = []
+    both = []
+    for result in (found.speckle, found.result):
+        noise, model = error_fields(result, frame.error_x, frame.error_y)
+        both.append(replace(frame, result=result, by_noise=noise, by_model_error=model))
+    mask = away_from_cuts(harvest.mask, harvest.grid, harvest.pitch)
+    harvest, compared = replace(harvest, geometry=replace(harvest.geometry, mask=mask)), []
     for i in frame.modes:
-        rows = (_values(mode_numbers(harvest, one, i)) for one in (frame, by_contours))
+        rows = (_values(mode_numbers(harvest, one, i)) for one in both)
         for (what, unit, speckle, sd), (_, _, value, own_sd) in zip(*rows, strict=True):
             compared.append(
                 {"mode": i + 1, "what": what, "unit": unit, "speckle": speckle, "speckle_sd": sd,
@@ -399,9 +411,9 @@ def _contours(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
             )  # fmt: skip
     return {
         "edge_sd_px": found.edge_sd_px,
-        "pattern_ratio": _pattern_ratio(harvest, result, frame.result),
+        "pattern_ratio": _pattern_ratio(harvest, *(one.result for one in reversed(both))),
         "compared": compared,
-        "warnings": errors.warnings,
+        "warnings": found.result.errors.warnings if found.result.errors else (),
     }
 
 
@@ -419,12 +431,9 @@ def _values(mode: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float]]:
 
 
 def _pattern_ratio(harvest: Harvest, result: Result, other: Result) -> float | None:
-    """One result's pattern over another's, by least squares over the part with holes."""
-    box, modes = harvest.geometry.region.cellular, range(len(result.ansatz.modes))
-    x, y = (
-        c + h * np.linspace(-1, 1, _CELLS // 2) for c, h in zip(box.centre, box.half, strict=True)
-    )
-    a, b = (sum(r.ansatz.fluctuation(i, r.unknowns, x[None], y[:, None]) for i in modes)
+    """One result's pattern over another's, by least squares over the material."""
+    (x, y, mask), modes = _few_pixels(harvest), range(len(result.ansatz.modes))
+    a, b = (sum(r.ansatz.fluctuation(i, r.unknowns, x, y)[mask] for i in modes)
             for r in (result, other))  # fmt: skip
     square = float(np.sum(b * b))
     return float(np.sum(a * b)) / square if square > 0.0 else None
