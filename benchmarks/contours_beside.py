@@ -66,13 +66,17 @@ def z_by_part(found: Result, best: Result) -> dict[str, FloatArray]:
     return {name: z[part][np.isfinite(z[part])] for name, part in parts.items()}
 
 
-def v_percent_in(box: Box, found: Result, best: Result) -> float:
-    """Largest difference of v1 from the best fit's in the cellular part of a box [%]."""
+def v_percent_in(box: Box, found: Result, best: Result) -> tuple[float, float]:
+    """Largest difference of v1 from the best fit's in the cellular part of a box, of its largest.
+
+    And its rms, of its rms [%].
+    """
     own = best.ansatz.modes[0].taper.cellular
     x = np.linspace(max(box.x_min, own.x_min), min(box.x_max, own.x_max), POINTS)
     y = np.linspace(max(box.y_min, own.y_min), min(box.y_max, own.y_max), POINTS)
     v, at_best = (r.ansatz.v(0, r.unknowns, x, y) for r in (found, best))
-    return 100.0 * float(np.abs(v - at_best).max() / np.abs(at_best).max())
+    off, of = ((np.abs(f).max(), np.sqrt(np.mean(f**2))) for f in (v - at_best, at_best))
+    return 100.0 * float(off[0] / of[0]), 100.0 * float(off[1] / of[1])
 
 
 def main() -> None:
@@ -121,8 +125,8 @@ def main() -> None:
                 ]
                 between = np.array([row["difference_sd"] for row in beside["compared"]], float)
                 print(
-                    f"{seed} {strain:.1%}: v1 off {off[0]:.2f} by speckle, {off[1]:.2f} % by "
-                    f"contours; waves {waves[0]:.3f}, {waves[1]:.3f} %; edges "
+                    f"{seed} {strain:.1%}: v1 off {off[0][0]:.2f} by speckle, {off[1][0]:.2f} % by "
+                    f"contours; rms {off[0][1]:.2f}, {off[1][1]:.2f} %; waves {waves[0]:.3f}, {waves[1]:.3f} %; edges "
                     f"{beside['edge_sd_px']:.2f} px; differences "
                     f"{np.sqrt(np.mean(between**2)):.2f} sd; {took:.0f} s",
                     flush=True,
@@ -130,7 +134,7 @@ def main() -> None:
                 parts = z_by_part(frame.contours.result, best) | {"difference": between}
                 for what, z in parts.items():
                     shares.setdefault(f"{strain:.1%}, {what}", []).append(z)
-                for what, value in (("v1 [%]", off[1]), ("waves [%]", waves[1])):
+                for what, value in (("v1 [%]", off[1][0]), ("waves [%]", waves[1])):
                     shares.setdefault(f"{strain:.1%}, {what}", []).append(np.array([value]))
     shares = {what: z for what, z in shares.items() if np.isfinite(np.concatenate(z)).any()}
     print("| of | in 95 % intervals [%] | error over its sd, rms |\n|---|---|---|")

@@ -534,12 +534,12 @@ def _from_cuts(mask: BoolArray) -> FloatArray:
 
 
 def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
-    """What is farther than so much [mm] from where a picture cuts the material (rows, cols)."""
+    """Elements with a node farther than so much [mm] from where a picture cuts the material."""
     mesh, distance = found.mesh, _from_cuts(mask) * found.grid.pixel_size
     at = np.rint(found.grid.to_px(*mesh.nodes.T)).astype(np.int64).T
     row, col = np.clip(at, 0, np.array(mask.shape) - 1).T
     far = distance[row, col] > reach
-    cells = mesh.cells[far[mesh.cells].all(axis=1)]
+    cells = mesh.cells[far[mesh.cells].any(axis=1)]
     if not cells.size:
         raise InputError(
             "contours: expected a specimen of which more is in view than a cell beside the "

@@ -24,6 +24,7 @@ from modeharvest.idic.finite_element.system import SAMPLES, Body
 from modeharvest.idic.photograph.plain import (
     CUT,
     PlainSurface,
+    away_from_cuts,
     contours_around,
     displacement_between,
 )
@@ -187,7 +188,8 @@ def measure_by_contours(
     Of a part in view the fit is that of what is farther than a cell from the picture's border.
     InputError if the contours don't belong together, or can't be found.
     """
-    grid, (mask, there) = pair.grid, pair.masks
+    grid, there = pair.grid, pair.masks[1]
+    mask = away_from_cuts(pair.masks[0], grid, cell_size)
     deformed = edges_of_speckled(pair.deformed, there, cell_size / grid.pixel_size)
     # A buckled hole's ends are too sharp to tell roughness from shape: the speckle is the same.
     deformed = replace(deformed, noise=reference.noise)

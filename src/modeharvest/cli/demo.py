@@ -57,8 +57,6 @@ def demo(
     Takes the solution of the paper's specimen that comes with the package, and larger pixels than
     the paper; leaves report.html in DIR. The first time kernels are compiled and kept.
     """
-    from modeharvest.report.experiment import experiment_report
-    from modeharvest.report.model import print_report
     from modeharvest.runs.case import Case, shipped_solution
     from modeharvest.runs.experiment import Run
 
@@ -68,5 +66,9 @@ def demo(
     case = case.model_copy(update={"title": title, "imaging": imaging})
     with bars() as progress:
         summary = Run(case, out, progress, shipped_solution(CASE)).all()
+    # Loaded by the run while kernels compile.
+    from modeharvest.report.experiment import experiment_report
+    from modeharvest.report.model import print_report
+
     print_report(experiment_report(summary), out)
     typer.echo("\n" + NEXT.format(case=CASE))

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -176,6 +177,7 @@ class Run(StagedRun[Case]):
                 solution = self.solved()
                 kernels.wait("image", self.progress)
                 self.image()
+                import_module("modeharvest.report.experiment")  # while kernels compile
                 kernels.wait("correlate", self.progress)
                 self.correlate()
             self.measure()
