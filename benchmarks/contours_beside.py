@@ -126,7 +126,8 @@ def main() -> None:
                 between = np.array([row["difference_sd"] for row in beside["compared"]], float)
                 print(
                     f"{seed} {strain:.1%}: v1 off {off[0][0]:.2f} by speckle, {off[1][0]:.2f} % by "
-                    f"contours; rms {off[0][1]:.2f}, {off[1][1]:.2f} %; waves {waves[0]:.3f}, {waves[1]:.3f} %; edges "
+                    f"contours; rms {off[0][1]:.2f}, {off[1][1]:.2f} %; "
+                    f"waves {waves[0]:.3f}, {waves[1]:.3f} %; edges "
                     f"{beside['edge_sd_px']:.2f} px; differences "
                     f"{np.sqrt(np.mean(between**2)):.2f} sd; {took:.0f} s",
                     flush=True,

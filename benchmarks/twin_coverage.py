@@ -277,7 +277,8 @@ def main() -> None:
     ).all()
     cases = grid({"name": options.name, "seed": 0}, seed=range(options.seeds))
     campaign = Campaign(options.of, cases, options.folder.resolve())
-    table = campaign.run(Workers(options.workers, "8GiB"), lambda d, n, what: print(f"{d}/{n}", end="\r"))
+    workers = Workers(options.workers, "8GiB")
+    table = campaign.run(workers, lambda done, count, what: print(f"{done}/{count}", end="\r"))
     failed = int((table["error"] != "").sum())
     print(f"{len(table)} seeds of noise, {failed} failed; {options.name}")
     for name in table:
