@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label
+from scipy.ndimage import binary_fill_holes, gaussian_filter, label
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import savgol_filter
 from scipy.spatial import cKDTree
@@ -520,25 +520,17 @@ def _after(
 
 def away_from_cuts(mask: BoolArray, grid: PixelGrid, cell_size: float) -> BoolArray:
     """(rows, cols) where a material is farther than a cell [mm] from where the border cuts it."""
-    return np.asarray(mask & (_from_cuts(mask) * grid.pixel_size > cell_size))
-
-
-def _from_cuts(mask: BoolArray) -> FloatArray:
-    """(rows, cols) distance from where the picture's border cuts a material (rows, cols) [px].
-
-    Infinite if it doesn't.
-    """
     cut = np.zeros_like(mask)
     cut[[0, -1]], cut[:, [0, -1]] = mask[[0, -1]], mask[:, [0, -1]]
-    return np.asarray(distance_transform_edt(~cut) if cut.any() else np.full(mask.shape, np.inf))
+    return mask & ~grown(cut, cell_size / grid.pixel_size)
 
 
 def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
     """Elements with a node farther than so much [mm] from where a picture cuts the material."""
-    mesh, distance = found.mesh, _from_cuts(mask) * found.grid.pixel_size
-    at = np.rint(found.grid.to_px(*mesh.nodes.T)).astype(np.int64).T
+    mesh, grid = found.mesh, found.grid
+    at = np.rint(grid.to_px(*mesh.nodes.T)).astype(np.int64).T
     row, col = np.clip(at, 0, np.array(mask.shape) - 1).T
-    far = distance[row, col] > reach
+    far = away_from_cuts(mask, grid, reach)[row, col]
     cells = mesh.cells[far[mesh.cells].any(axis=1)]
     if not cells.size:
         raise InputError(
