@@ -110,12 +110,10 @@ class Run(StagedRun[Case]):
             how, paths = self.case.correlation, []
             ansatz = how.ansatz(self.case.experiment.specimen)
             for strain in images.strains:
+                pair = images.pair(strain, camera=how.camera)
+                guess = ansatz.initial_guess(strain, how.start_amplitude)
                 result = correlate(
-                    images.pair(strain, camera=how.camera),
-                    ansatz,
-                    guess=ansatz.initial_guess(strain, how.start_amplitude),
-                    options=how.options(),
-                    progress=self.progress,
+                    pair, ansatz, guess=guess, options=how.options(), progress=self.progress
                 )
                 paths.append(self._result_path(strain))
                 result.write(paths[-1])
