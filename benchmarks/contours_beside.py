@@ -29,7 +29,7 @@ from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.photograph.geometry import box_of
 from modeharvest.idic.photograph.plain import away_from_cuts
 from modeharvest.idic.result import Result
-from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
@@ -79,6 +79,14 @@ def v_percent_in(box: Box, found: Result, best: Result) -> tuple[float, float]:
     return 100.0 * float(off[0] / of[0]), 100.0 * float(off[1] / of[1])
 
 
+def photographed(folder: Path, pixel_size: float, seed: int) -> ImageSet:
+    """Photographs with a seed's own speckle and noise, and their truth."""
+    speckle = SpeckleSpec(standard_deviation=0.08, blur_px=1.5, seed=seed)
+    sensor = Sensor(fill_factor=1.0, psf_px=0.6, read_noise=0.01, read_seed=seed)
+    spec = ImagingSpec(pixel_size, 40, background=0.06, speckle=speckle, sensor=sensor, bits=8)
+    return make_images(Solution.read(SHIPPED), spec, folder, STRAINS)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -90,15 +98,9 @@ def main() -> None:
     for seed in range(given.seeds):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            spec = ImagingSpec(
-                given.pixel_size, 40, background=0.06,
-                speckle=SpeckleSpec(standard_deviation=0.08, blur_px=1.5, seed=seed),
-                sensor=Sensor(fill_factor=1.0, psf_px=0.6, read_noise=0.01, read_seed=seed),
-                bits=8,
-            )  # fmt: skip
-            images = make_images(Solution.read(SHIPPED), spec, folder, STRAINS)
-            rows, cols = (slice(round(0.5 * (1.0 - given.in_view) * n), n - round(
-                0.5 * (1.0 - given.in_view) * n)) for n in images.grid.shape)  # fmt: skip
+            images = photographed(folder, given.pixel_size, seed)
+            cut = [round(0.5 * (1.0 - given.in_view) * n) for n in images.grid.shape]
+            rows, cols = (slice(c, n - c) for c, n in zip(cut, images.grid.shape, strict=True))
             for path in folder.glob("*_8bit.tif"):
                 write_image(path, tifffile.imread(path)[rows, cols])
             (folder / "test.toml").write_text(CASE.format(pixel_size=given.pixel_size))

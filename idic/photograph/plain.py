@@ -493,7 +493,7 @@ def displacement_between(
     found = _after(matched, body, grid, before, progress)
     if reference.is_part:
         centres = np.array([hole.moments[1] for hole, _ in matched.holes])
-        found = _away_from_cuts(found, reference.mask, _spacing(centres))
+        found = _inner_part(found, reference.mask, _spacing(centres))
     if matched.lost:
         lost = f"{matched.lost} holes weren't found again: what is around them follows from a law."
         found = replace(found, warnings=(*found.warnings, lost))
@@ -525,7 +525,7 @@ def away_from_cuts(mask: BoolArray, grid: PixelGrid, cell_size: float) -> BoolAr
     return mask & ~grown(cut, cell_size / grid.pixel_size)
 
 
-def _away_from_cuts(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
+def _inner_part(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
     """Elements with a node farther than so much [mm] from where a picture cuts the material."""
     mesh, grid = found.mesh, found.grid
     at = np.rint(grid.to_px(*mesh.nodes.T)).astype(np.int64).T
