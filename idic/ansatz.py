@@ -8,8 +8,8 @@ Source: the paper's Eq. (u_dic). Everything is in mm in the physical frame (x ri
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -69,6 +69,26 @@ class AnsatzOptions:
     def brightness(self) -> Brightness:
         """Which of gain and offset are unknowns."""
         return Brightness(self.gain_degree, self.offset_degree)
+
+
+_Degrees = TypeVar("_Degrees", bound="AnsatzOptions | Ansatz")
+FEWEST_CELLS = 3
+"""Across a pattern, below which its mode is off by percents whatever the degrees are."""
+
+
+def for_cells(degrees: _Degrees, specimen: Box, pattern: Box, cell_size: float) -> _Degrees:
+    """Lower the degrees of v0 and v_i to those that boxes of few cells [mm] can tell.
+
+    To two for every cell across but the first, and at least two: with more v1 and the mode's
+    parameters replace one another (``benchmarks/few_cells.py``).
+    """
+    v0, v = (max(2, 2 * round(cells_across(box, cell_size)) - 2) for box in (specimen, pattern))
+    return replace(degrees, v0_degree=min(v0, degrees.v0_degree), v_degree=min(v, degrees.v_degree))
+
+
+def cells_across(box: Box, cell_size: float) -> float:
+    """A box's shorter side over a cell size [mm]."""
+    return 2.0 * min(box.half) / cell_size
 
 
 @dataclass(frozen=True, eq=False)

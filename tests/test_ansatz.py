@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions, ansatz_from_dict, for_cells
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import square_family
 from modeharvest.util.errors import InputError
@@ -116,3 +116,11 @@ def test_bad_input() -> None:
         ansatz.checked(bad)
     with pytest.raises(InputError, match="v0_degree from 1"):
         Ansatz(Box.centred(1, 1), v0_degree=0)
+
+
+@pytest.mark.parametrize(("cells", "degrees"), [(1, 2), (2, 2), (3, 4), (3.4, 4), (4, 6), (9, 6)])
+def test_few_cells_have_lower_degrees(cells: float, degrees: int) -> None:
+    pattern, specimen = Box.centred(1.9 * cells, 38.0), Box.centred(19.0, 38.0)
+    lower = for_cells(AnsatzOptions(), specimen, pattern, 1.9)
+    assert (lower.v0_degree, lower.v_degree) == (5, degrees)
+    assert for_cells(AnsatzOptions(1, 0), pattern, pattern, 1.9) == AnsatzOptions(1, 0)

@@ -300,6 +300,20 @@ def chosen(vectors: np.ndarray, how: PhotographOptions) -> tuple[Geometry, Fouri
     return geometry, mode
 
 
+@pytest.mark.parametrize("cells", [(2, 5), (6, 2), (3, 3), (4, 6)])
+def test_a_pattern_of_few_cells_is_warned_of(cells: tuple[int, int]) -> None:
+    around = Box.centred(*(1.9 * n for n in cells))
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    holes = ~holes_mask(
+        GRID, 1.9 * np.eye(2), 0.7, (0.95 * ((1 + cells[0]) % 2), 0.95 * ((1 + cells[1]) % 2))
+    )
+    geometry = find_geometry(~(holes & around.contains(x, y)), GRID, SpecimenTable(1.9), Path())
+    assert geometry.lattice is not None
+    assert len(geometry.lattice) == np.prod(cells)
+    warned = " ".join(geometry.few_cells(1.9))
+    assert ("is 2.0 cells across in view: on fewer than 3" in warned) == (min(cells) < 3)
+
+
 @pytest.mark.parametrize("height", [1.9, 2.4])
 @pytest.mark.parametrize("how", [{"family": "square"}, {"fixed_mode": False}])
 def test_eq_mode_begins_on_the_lattice_of_the_holes(height: float, how: dict[str, object]) -> None:

@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 168, 34_987
+MOST_MODULES, MOST_LINES = 168, 35_019
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -82,7 +82,7 @@ OWN_BOUNDS = {
     HOMOGENIZATION: (19, 3_810), OWN_CELLS: (7, 960), IDENTIFICATION: (19, 4_076),
     DESIGN: (6, 864),
     FIRST_TOUCH: (3, 350),
-    CONTOURS: (11, 4_227), SEQUENCES: (10, 2_768), EXPLORE: (2, 300), SHARED_DATA: (3, 450),
+    CONTOURS: (11, 4_247), SEQUENCES: (10, 2_768), EXPLORE: (2, 300), SHARED_DATA: (3, 450),
     GAUGES_AND_FORMATS: (9, 1_739),
     WHOLE_DISPLACEMENT: (7, 2_201),
 }  # fmt: skip

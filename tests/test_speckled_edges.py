@@ -23,12 +23,14 @@ from modeharvest.idic.photograph.speckled_edges import (
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.contour import Contour
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.photographs.pipeline import harvest
+from modeharvest.util.errors import InputError
 from modeharvest.validation.whole_field import v_percent, waves_percent
 
 pytest.importorskip("gmsh")
@@ -95,12 +97,11 @@ def test_contours_alone_show_the_modes(folder: Path) -> None:
 def test_of_a_part_in_view_the_pixels_away_from_its_border_are_compared(
     folder: Path, tmp_path: Path
 ) -> None:
-    rows, cols = np.s_[150:650], np.s_[110:540]
+    rows, cols = np.s_[150:650], np.s_[125:525]
     for path in folder.glob("*_8bit.tif"):
         write_image(tmp_path / path.name, tifffile.imread(path)[rows, cols])
     text = (folder / "experiment.toml").read_text("utf-8")
-    few = "[correlation]\nv0_degree = 3\nv_degree = 2\n"  # three by five cells show no more
-    (tmp_path / "experiment.toml").write_text(text + few)
+    (tmp_path / "experiment.toml").write_text(text)
     summary = harvest(tmp_path / "experiment.toml", tmp_path / "out", contours=True)
     (frame,) = summary["frames"]
     assert faults(summary, "harvest") == []
@@ -118,7 +119,24 @@ def test_of_a_part_in_view_the_pixels_away_from_its_border_are_compared(
            for r in (found, speckle)]  # fmt: skip
     assert off[0] < min(0.3 * FINER, off[1])
     assert waves_percent(found, best) < 0.3
+    # Three by five cells show no more; the whole picture does.
+    assert (found.ansatz.v0_degree, found.ansatz.v_degree) == (4, 4)
     assert beside["edge_sd_px"] < 0.5
     waves = [row["difference_sd"] for row in beside["compared"] if "wave" in row["what"]]
     assert np.abs(waves).max() < 2.0
     assert abs(beside["pattern_ratio"] - 1.0) < 0.06
+
+
+def test_too_small_a_part_is_refused() -> None:
+    """Of a picture of four by four cells two are a cell from its border."""
+    inner = np.s_[46:-46, 46:-46]
+    image, mask = PHOTOGRAPHED.image()[inner], PHOTOGRAPHED.mask[inner]
+    grid = PixelGrid.centred(*mask.shape, PIXEL)
+    edges = edges_of_speckled(image, mask, PITCH / PIXEL)
+    pair = ImagePair(image, image, grid, mask, mask)
+    known = fit_displacement(
+        np.zeros((*mask.shape, 2)), grid, Ansatz(Box(*grid.extent)), np.zeros(42)
+    )
+    body = body_for_edges(mask, grid, PITCH / PIXEL)
+    with pytest.raises(InputError, match=r"3 cells across or more .* got 2\.0; take more"):
+        measure_by_contours(edges, pair, known, PITCH, body)

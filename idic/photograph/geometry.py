@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import find_objects, label
 from skimage.draw import polygon2mask
 
+from modeharvest.idic.ansatz import FEWEST_CELLS, cells_across
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.imaging.grid import PixelGrid
@@ -240,6 +241,12 @@ _OVERLAP = 0.5
 """Cells by which the boxes of two parts may overlap; so wide are the tapers of their modes."""
 
 
+_FEW = (
+    "The pattern is {:.1f} cells across in view: on fewer than {} its wave vectors and a1 are off "
+    "by percents, and v1 with them, more than error bars say; take more of it into view."
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Geometry:
     """The specimen as the reference shows it."""
@@ -268,6 +275,11 @@ class Geometry:
             return None
         row, col = lattice.vectors.T
         return np.asarray(np.column_stack([col, -row]) * self.grid.pixel_size)
+
+    def few_cells(self, cell_size: float) -> tuple[str, ...]:
+        """What to warn of if a part has too few cells [mm] across for its wave vectors."""
+        across = min(cells_across(box, cell_size) for box in self.parts.values())
+        return (_FEW.format(across, FEWEST_CELLS),) * (round(across) < FEWEST_CELLS)
 
 
 def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: Path) -> Geometry:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.ansatz import Ansatz, for_cells
 from modeharvest.idic.correlate import ASTRAY, correlate
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField, refitted, refitted_correlation
@@ -61,6 +61,7 @@ _REFITTED = (
     "ansatz refitted to the whole displacement, with the standard deviations by noise that a "
     "correlation would have."
 )
+_LOWER = "There are few cells: v0 is of degree {} and v1 of degree {}."
 
 
 def image_noise(pair: ImagePair, camera: CameraNoise) -> ImageNoise:
@@ -149,7 +150,7 @@ def measure(
     text = (matching, *text)
     options, found = how.options(), None
     if before is not None and _goes_on(before.result, ansatz, unknowns):
-        again, there = _with_brightness(before.result, how)
+        again, there = with_brightness(before.result, how)
         found = correlate(pair, again, guess=there, options=options, progress=progress)
     if found is not None and found.outcome is Outcome.CONVERGED:
         text = (*text, "The correlation started from the result of the photograph before.")
@@ -215,15 +216,18 @@ def found_modes(
     local: LocalField | None, holes: LocalField | None = None,
 ) -> tuple[InitialGuess, Ansatz, FloatArray, tuple[str, ...]]:  # fmt: skip
     """An initial guess, the ansatz and the unknowns that are chosen from it, and how, in words."""
+    region = geometry.region
+    lower = for_cells(how, region.domain, region.cellular, cell_size)
     guess = initial_guess(
         pair, cell_size, list(geometry.parts.values()), local=local, holes=holes,
-        lattice=geometry.lattice_mm, domain=geometry.region.domain, options=how,
+        lattice=geometry.lattice_mm, domain=region.domain, options=lower,
     )  # fmt: skip
-    ansatz, unknowns = chosen_modes(guess, geometry, cell_size, how)
-    return guess, ansatz, unknowns, _guess_text(guess, ansatz, geometry)
+    ansatz, unknowns = chosen_modes(guess, geometry, cell_size, lower)
+    text = (_LOWER.format(lower.v0_degree, lower.v_degree),) * (lower != how)
+    return guess, ansatz, unknowns, (*_guess_text(guess, ansatz, geometry), *text)
 
 
-def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
+def with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
     """Ansatz and unknowns of a result with the specified brightness, as an initial guess."""
     ansatz = replace(result.ansatz, brightness=how.brightness)
     first = result.ansatz.phi_offset(len(result.ansatz.modes))

@@ -18,9 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates
 
+from modeharvest.idic.ansatz import FEWEST_CELLS, cells_across, for_cells
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import refitted
 from modeharvest.idic.finite_element.system import SAMPLES, Body
+from modeharvest.idic.photograph.geometry import box_of
 from modeharvest.idic.photograph.plain import (
     CUT,
     PlainSurface,
@@ -185,17 +187,28 @@ def measure_by_contours(
     pair : the photographs with both masks of the material.
     body : by :func:`body_for_edges`, of the reference's mask.
 
-    Of a part in view the fit is that of what is farther than a cell from the picture's border.
-    InputError if the contours don't belong together, or can't be found.
+    Of a part in view the fit is that of what is farther than a cell from the picture's border, by
+    an ansatz for so many cells. InputError if these are too few, if the contours don't belong
+    together, or can't be found.
     """
     grid, there = pair.grid, pair.masks[1]
     mask = away_from_cuts(pair.masks[0], grid, cell_size)
+    ansatz, a = speckle.ansatz, speckle.unknowns
+    if reference.is_part:
+        across = cells_across(part := box_of(mask, grid), cell_size) if mask.any() else 0.0
+        if round(across) < FEWEST_CELLS:
+            raise InputError(
+                f"contours: expected {FEWEST_CELLS} cells across or more that are farther than one "
+                f"from the picture's border, got {across:.1f}; take more into view"
+            )
+        ansatz = for_cells(ansatz, part, part, cell_size)
+        a = ansatz.initial_guess()
     deformed = edges_of_speckled(pair.deformed, there, cell_size / grid.pixel_size)
     # A buckled hole's ends are too sharp to tell roughness from shape: the speckle is the same.
     deformed = replace(deformed, noise=reference.noise)
     begin = speckle.ansatz.displacement_at(speckle.unknowns, body.mesh.nodes)
     measured, _ = displacement_between(reference, deformed, grid, body, progress, begin)
-    fit = refitted(measured, speckle.ansatz, speckle.unknowns, mask)
+    fit = refitted(measured, ansatz, a, mask)
     assert measured.roots is not None
     by_noise = replace(measured, roots=measured.roots[..., :SAMPLES])
     result = refitted(by_noise, fit.ansatz, fit.unknowns, mask)

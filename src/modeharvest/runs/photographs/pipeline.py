@@ -42,6 +42,7 @@ from modeharvest.idic.photograph.measure import (
     measure_whole,
     residual_test,
     warped_back,
+    with_brightness,
 )
 from modeharvest.idic.photograph.plain import (
     PlainSurface,
@@ -180,7 +181,8 @@ class HarvestRun(StagedRun[PhotographCase]):
             case, self.geometry, prepared.image(), (), prepared.noise,
             skipped=(*prepared.skipped, *self.failures()), optics=self.optics,
             full_scale=prepared.full_scale, text=(*prepared.notes, *region.text),
-            warnings=prepared.warnings, truth=truth,
+            warnings=(*prepared.warnings, *self.geometry.few_cells(case.specimen.cell_size)),
+            truth=truth,
             command=f"modeharvest harvest {self.source} --out {self.folder}",
             toml=source.read_text("utf-8") if source.is_file() else "",
             versions=versions(*prepare.LIBRARIES),
@@ -291,7 +293,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             found = measure_by_contours(edges, pair, speckle, cell.cell_size, body, self.progress)
             if edges.is_part:  # w, which the ansatz can't describe, has other fits on other pixels
                 mask = away_from_cuts(pair.masks[0], grid, cell.cell_size)
-                speckle = self._correlated_again(replace(pair, mask=mask), speckle)
+                speckle = self._correlated_again(replace(pair, mask=mask), found.result)
             for path, result in zip(paths, (found.result, speckle), strict=True):
                 result.write(path)
             return paths, picked(found, "edge_sd_px")
@@ -305,9 +307,12 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     def _correlated_again(self, pair: ImagePair, known: Result) -> Result:
         """A result's ansatz on other pixels of the reference, from there on, with errors."""
-        how, a, progress = self.case.correlation.options(), known.unknowns, self.progress
+        (ansatz, a), how = (
+            with_brightness(known, self.case.correlation),
+            self.case.correlation.options(),
+        )
         how = replace(how, levels=how.levels[-1:])
-        found = correlate(pair, known.ansatz, guess=a, options=how, progress=progress)
+        found = correlate(pair, ansatz, guess=a, options=how, progress=self.progress)
         return replace(found, errors=self._covariance(found, pair))
 
     @cached_property

@@ -218,9 +218,8 @@ def shown_moments(moments: Sequence[ImageAmplitude]) -> tuple[int, ...]:
 
 def rms_errors(frame: HarvestedFrame, errors: FieldErrors, box: Box) -> dict[str, float]:
     """Rms standard deviation per component over a box [px], by field; of the pattern with modes."""
-    rows = (box.y_min <= frame.error_y) & (frame.error_y <= box.y_max)
-    cols = (box.x_min <= frame.error_x) & (frame.error_x <= box.x_max)
-    inside, px = np.ix_(rows, cols), frame.result.grid.pixel_size
+    inside = box.contains(frame.error_x, frame.error_y[:, None])
+    px = frame.result.grid.pixel_size
     squares = {"v0": errors.v0**2, "displacement": errors.displacement**2}
     if frame.modes:
         squares["fluctuation"] = (errors.fluctuation**2).sum(axis=0)
@@ -285,8 +284,7 @@ def _few_pixels(harvest: Harvest) -> tuple[FloatArray, FloatArray, BoolArray]:
 def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
     """The largest |v| and the largest length of v phi on the material of the mode's own part."""
     (x, y, mask), box = _few_pixels(harvest), frame.result.ansatz.modes[i].taper.cellular
-    inside = mask & ((box.y_min <= y) & (y <= box.y_max))[:, None]
-    inside &= ((box.x_min <= x) & (x <= box.x_max))[None, :]
+    inside = mask & box.contains(x, y[:, None])
     ansatz, a = frame.result.ansatz, frame.result.unknowns
     v = np.where(inside, np.abs(ansatz.v(i, a, x, y)), 0.0)
     length = np.linalg.norm(ansatz.fluctuation(i, a, x, y), axis=-1)
