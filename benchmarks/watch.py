@@ -149,15 +149,19 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
 def least_deviation(columns: FloatArray, imperfection: float, critical: float) -> float:
     """Least standard deviation of any unbiased prediction, of the critical load (Cramér–Rao).
 
-    ``columns`` (3, n): load, amplitude and its standard deviation, half of whose variance all
-    images have in common. The linear part is expected to be 0 +- 0.15 of what the imperfection
-    gives, as in ``validation/growth.py``.
+    ``columns`` (4, n): load, amplitude and its standard deviations, by noise, half of whose
+    variance all images have in common, and by model error. The linear part is expected to be 0 +-
+    0.15 of what the imperfection gives and the latter, the quadratic one the latter, as in
+    ``validation/growth.py``.
     """
-    load, _, sd = columns
+    load, _, sd, model = columns
     ahead, a0 = critical - load, abs(imperfection)
-    J = np.stack([-a0 * load / ahead**2, load / ahead, load, sd], axis=1)
+    x = load / load[-1]
+    J = np.stack([-a0 * load / ahead**2, load / ahead, x, x**2, sd], axis=1)
     J /= (sd * np.sqrt(0.5))[:, None]
-    information = J.T @ J + np.diag([0.0, 0.0, (critical / (0.15 * a0)) ** 2, 2.0])
+    linear = np.hypot(0.15 * a0 * load[-1] / critical, model[-1])
+    prior = np.diag([0.0, 0.0, 1.0 / linear**2, 1.0 / model[-1] ** 2, 2.0])
+    information = J.T @ J + prior
     return float(np.sqrt(np.linalg.inv(information)[0, 0])) / critical
 
 

@@ -20,7 +20,7 @@ from modeharvest.idic.modes import square_family
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.watch import WatchedTest, arriving, watch
 from modeharvest.util.errors import InputError
-from modeharvest.validation.growth import follow_growth, predict
+from modeharvest.validation.growth import Prediction, follow_growth, predict
 
 PITCH, PIXEL = 1.9, 0.035
 CRITICAL = 0.06
@@ -37,10 +37,16 @@ def grown(load: np.ndarray, linear: float = 3.0, imperfection: float = 5.0) -> n
     return linear * load + imperfection * load / (0.1 - load)
 
 
+def predicted(
+    load: np.ndarray, amplitude: np.ndarray, sd: np.ndarray, model_sd: float = 0.0
+) -> Prediction | None:
+    return predict(np.array([load, amplitude, sd, sd + model_sd]))
+
+
 def test_growth_without_noise_points_to_the_critical_load() -> None:
     load = np.linspace(0.005, 0.06, 12)
     for linear, imperfection in ((0.0, 5.0), (40.0, 5.0), (-20.0, -1.0)):
-        found = predict(load, grown(load, linear, imperfection), np.full(12, 1e-6))
+        found = predicted(load, grown(load, linear, imperfection), np.full(12, 1e-6))
         assert found is not None
         assert found.critical == pytest.approx(0.1, rel=2e-3)  # the grid of what is tried
         assert found.imperfection == pytest.approx(imperfection, rel=0.02)
@@ -54,16 +60,33 @@ def test_intervals_hold_over_seeds() -> None:
     covered = []
     for seed in range(200):
         noise = sd * np.random.default_rng(seed).normal(size=20)
-        found = predict(load, grown(load) + noise, sd)
+        found = predicted(load, grown(load) + noise, sd)
         assert found is not None
         covered.append(found.low <= 0.1 <= found.high)
     assert 0.93 <= np.mean(covered) <= 1.0
 
 
+def test_model_error_grows_with_the_load_and_is_no_noise() -> None:
+    """A linear part as large as it says leaves the prediction; as noise it would blur it."""
+    load, random = np.linspace(0.004, 0.07, 20), np.random.default_rng(5)
+    noise, model = 0.02, 2.0
+    amplitude = grown(load, -model / load[-1]) + noise * random.normal(size=20)
+    sd = np.full(20, noise)
+    apart, as_noise, unknown = (
+        predicted(load, amplitude, *how) for how in ((sd, model), (sd + model,), (sd,))
+    )
+    assert apart is not None
+    assert as_noise is not None
+    assert unknown is not None
+    assert apart.low < 0.1 < apart.high
+    assert apart.high - apart.low < 0.5 * (as_noise.high - as_noise.low)
+    assert abs(apart.critical - 0.1) < abs(unknown.critical - 0.1)
+
+
 def test_noise_that_is_larger_than_it_says_widens_the_interval() -> None:
     load, random = np.linspace(0.004, 0.07, 20), np.random.default_rng(3)
     amplitude = grown(load) + 0.1 * random.normal(size=20)
-    modest, honest = (predict(load, amplitude, np.full(20, sd)) for sd in (1e-4, 0.1))
+    modest, honest = (predicted(load, amplitude, np.full(20, sd)) for sd in (1e-4, 0.1))
     assert modest is not None
     assert honest is not None
     assert modest.high - modest.low > 0.7 * (honest.high - honest.low)
@@ -72,17 +95,17 @@ def test_noise_that_is_larger_than_it_says_widens_the_interval() -> None:
 def test_what_does_not_grow_predicts_nothing() -> None:
     load = np.linspace(0.01, 0.06, 12)
     noise = np.random.default_rng(1).normal(size=12)
-    found = predict(load, noise, np.ones(12))
+    found = predicted(load, noise, np.ones(12))
     assert found is None or not found.is_useful
-    found = predict(load, 3.0 * load, np.full(12, 1e-3))  # along a straight line
+    found = predicted(load, 3.0 * load, np.full(12, 1e-3))  # along a straight line
     assert found is None or not found.is_useful
-    assert predict(load[:4], grown(load[:4]), np.ones(4)) is None
+    assert predicted(load[:4], grown(load[:4]), np.ones(4)) is None
 
 
 def test_a_prediction_stays_once_buckling_is_near() -> None:
     load = np.linspace(0.005, 0.13, 26)
     amplitude = np.where(load < 0.097, grown(np.minimum(load, 0.097)), 200.0)
-    found = follow_growth(np.array([load, amplitude, 0.0 * load + 0.01]))
+    found = follow_growth(np.array([load, amplitude, 0.0 * load + 0.01, 0.0 * load + 0.01]))
     assert found[3] is None
     assert found[-1] == found[20]
     assert found[-1] is not None

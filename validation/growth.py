@@ -1,10 +1,10 @@
 """The critical load from the growth of an imperfect pattern, before it buckles.
 
-An imperfect specimen's pattern grows from the beginning, a = c p + a0 p / (p_c - p) with the load
-p: the second term is the critical mode's, with an imperfection a0 (R. V. Southwell, Proc. R. Soc.
-A 135 (1932), doi 10.1098/rspa.1932.0055), the first that of all others, which are far from theirs,
-and of the model error. Of each p_c the posterior probability is computed, c, a0 and the error that
-all images have in common integrated out.
+An imperfect specimen's pattern grows from the beginning, a = a0 p / (p_c - p) + c p + d p^2 with
+the load p: the first term is the critical mode's, with an imperfection a0 (R. V. Southwell, Proc.
+R. Soc. A 135 (1932), doi 10.1098/rspa.1932.0055), the others those of all other modes, which are
+far from theirs, and of the model error. Of each p_c the posterior probability is computed, a0, c, d
+and the error that all images have in common integrated out.
 
 Modes differ by their envelopes. The critical one's is a half wave across the lattice both ways, and
 :func:`half_wave` picks its amplitude out of v; the others' are nearly orthogonal to it.
@@ -31,9 +31,9 @@ docs/how-to/sequences.md."""
 _QUANTILES = (0.025, 0.5, 0.975)
 _COMMON = 0.5
 """Share of the amplitudes' variance by noise of the reference, which all images have in common."""
-_OTHERS, _OF_MODEL = 0.15, 1.0
-"""c is expected to be so much of a0 / p_c, and so many standard deviations of the last amplitude
-over its load, by model error, give or take: see docs/how-to/sequences.md."""
+_OTHERS = 0.15
+"""c p is expected to be so much of a0 p / p_c and, as d p^2 is, of the standard deviation by model
+error at the last image, give or take: see docs/how-to/sequences.md."""
 _FAR, _NEGLIGIBLE = 10.0, 0.02
 """Times the largest load: growth that points further, by a density over its largest, isn't seen."""
 _TRIED, _ROUNDS = 2000, 4
@@ -50,8 +50,8 @@ class Prediction:
     """The median's interval of 95 %; infinite where growth isn't told from a straight line."""
     imperfection: float
     """a0, in the unit of the amplitudes."""
-    linear: float
-    """c, the same per load."""
+    others: tuple[float, float, float]
+    """d, c and 0: the polynomial d p^2 + c p, the highest power first."""
     largest: float
     """Of the loads that it is made from."""
     count: int
@@ -69,61 +69,60 @@ class Prediction:
         return self.high - self.low < self.critical
 
 
-def half_wave(result: Result, cellular: Box, i: int = 0) -> tuple[float, float]:
-    """Amplitude of a half wave in v_i, both ways across a part of the specimen, and its sd [mm].
+def half_wave(result: Result, cellular: Box, noise: float) -> tuple[float, float, float]:
+    """Amplitude of a half wave in v1, both ways across a part of the specimen [mm].
 
-    The latter by white noise of the images, as large as the residual.
+    And its standard deviations by noise [grey levels], and by all of the residual, model error too.
     """
-    ansatz = result.ansatz
-    ends = np.linspace(-1.0, 1.0, _POINTS)
+    ansatz, ends = result.ansatz, np.linspace(-1.0, 1.0, _POINTS)
     x, y = (c + h * ends for c, h in zip(cellular.centre, cellular.half, strict=True))
     wave = np.cos(0.5 * np.pi * ends)[:, None] * np.cos(0.5 * np.pi * ends)
     basis = ansatz.v_space.basis(x[None, :], y[:, None])
     weights = np.einsum("yx,yxk->k", wave, basis) / (wave**2).sum()
-    part = ansatz.v_slice(i)
-    variance = weights @ result.covariance()[part, part] @ weights
-    return float(weights @ result.unknowns[part]), float(np.sqrt(variance))
+    part = ansatz.v_slice(0)
+    of_both = (result.covariance(of)[part, part] for of in (noise, result.noise_sd))
+    sd = [float(np.sqrt(weights @ covariance @ weights)) for covariance in of_both]
+    return float(weights @ result.unknowns[part]), sd[0], max(sd)
 
 
-def predict(load: FloatArray, amplitude: FloatArray, sd: FloatArray) -> Prediction | None:
+def predict(columns: FloatArray) -> Prediction | None:
     """Extrapolate the growth of a pattern's amplitude to the critical load.
 
-    ``load``, ``amplitude``, ``sd`` (n,): of the images, the last of one sign and below the critical
-    load. Where the amplitudes scatter more than their standard deviations say, that counts. None
-    from fewer than five images, or if the pattern doesn't grow.
+    ``columns`` (4, n): load, amplitude and its standard deviations by noise, which counts as what
+    the amplitudes scatter if that is more, and by model error, which grows with the load; the last
+    of one sign and below the critical load. None from fewer than five, or if nothing grows.
     """
-    used = load > 0.0
-    load, amplitude, sd = load[used], amplitude[used], sd[used]
+    load, amplitude, sd, model = columns[:, columns[0] > 0.0]
     if len(load) < FEWEST or not (sd > 0.0).all():
         return None
-    last = int(np.argmax(load))
-    tried = load[last] * np.geomspace(1.0 + 1e-3, _FAR, _TRIED)
-    weight = 1.0 / (sd * np.sqrt(1.0 - _COMMON))
-    columns = np.stack(np.broadcast_arrays(load / (tried[:, None] - load), load, sd), axis=1)
+    last, most = int(np.argmax(load)), float(load.max())
+    tried = most * np.geomspace(1.0 + 1e-3, _FAR, _TRIED)
+    weight, x = 1.0 / (sd * np.sqrt(1.0 - _COMMON)), load / most
+    columns = np.stack(np.broadcast_arrays(load / (tried[:, None] - load), x, x**2, sd), axis=1)
     columns, a = columns * weight, amplitude * weight
     normal, right = columns @ columns.swapaxes(1, 2), columns @ a
-    by_model, scatter = _OF_MODEL * sd[last] / load[last], 1.0
-    linear = np.full(_TRIED, np.hypot(by_model, amplitude[last] / load[last]))
-    for _ in range(_ROUNDS):  # for each critical load the best a0, c and what errors have in common
-        prior = np.stack([0.0 * tried, scatter / linear**2, 0.0 * tried + 1.0 / _COMMON], axis=1)
-        A = normal + prior[:, None] * np.eye(3)
+    scatter, zero = 1.0, np.zeros(_TRIED)
+    linear = zero + np.hypot(model[last], amplitude[last])
+    for _ in range(_ROUNDS):  # of each critical load a0, c, d, and what errors have in common
+        prior = [zero, scatter / linear**2, zero + scatter / model[last] ** 2, zero + 1.0 / _COMMON]
+        A = normal + np.stack(prior, axis=1)[:, None] * np.eye(4)
         found = np.linalg.solve(A, right[..., None])[..., 0]
         cost = (a @ a - (right * found).sum(axis=1)) / scatter
         chance = -0.5 * cost - 0.5 * np.linalg.slogdet(A)[1] - np.log(linear)
         best = int(np.argmax(chance))
         scatter = max(1.0, float(cost[best]) * scatter / (len(load) - 3))
-        linear = np.hypot(by_model, _OTHERS * np.abs(found[:, 0]) / tried)
+        linear = np.hypot(model[last], _OTHERS * np.abs(found[:, 0]) * most / tried)
     share = np.exp(chance - chance[best])
     quantiles = np.interp(_QUANTILES, np.cumsum(share) / share.sum(), tried)
     k = int(np.searchsorted(tried, quantiles[1]))
-    if found[k, 0] * amplitude[last] <= 0.0:
+    a0, c, d, _ = found[k].tolist()
+    if a0 * amplitude[last] <= 0.0:
         return None
     critical = float(quantiles[1])
-    below, _, above = np.hypot(quantiles - critical, 2.0 * OF_METHOD * critical).tolist()
-    return Prediction(
-        critical, critical - below, critical + above if share[-1] < _NEGLIGIBLE else float("inf"),
-        float(found[k, 0]), float(found[k, 1]), float(load[last]), len(load),
-    )  # fmt: skip
+    below, _, above = map(float, np.hypot(quantiles - critical, 2.0 * OF_METHOD * critical))
+    high = critical + above if share[-1] < _NEGLIGIBLE else float("inf")
+    others = d / most**2, c / most, 0.0
+    return Prediction(critical, critical - below, high, a0, others, most, len(load))
 
 
 def follow_growth(
@@ -131,12 +130,12 @@ def follow_growth(
 ) -> list[Prediction | None]:
     """The prediction after each image of a test, in their order; of the first ones it is known.
 
-    ``columns`` (3, n): as for :func:`predict`. A prediction stays as it is once the load is beyond
+    ``columns`` (4, n): as for :func:`predict`. A prediction stays as it is once the load is beyond
     nine tenths of it, as buckling no longer lies ahead, and on the way back.
     """
     found = list(known)
     for n in range(len(found) + 1, columns.shape[1] + 1):
         load, last = columns[0, :n], found[-1] if found else None
         is_ahead = last is None or not last.is_useful or load[-1] < NEAR * last.critical
-        found.append(predict(*columns[:, :n]) if is_ahead and load[-1] >= load.max() else last)
+        found.append(predict(columns[:, :n]) if is_ahead and load[-1] >= load.max() else last)
     return found

@@ -109,12 +109,12 @@ def _interval(axes: Any, found: Prediction) -> None:
 
 def draw_amplitude(test: WatchedTest, found: Prediction | None) -> Figure:
     """Draw v1's half wave over the strain, and the growth that was fitted to it."""
-    strain, amplitude, sd = test.columns
+    strain, amplitude, sd, _ = test.columns
     drawn, axes = curve("nominal strain [%]", "v₁, half wave [µm]")
     axes.errorbar(100 * strain, 1e3 * amplitude, 2e3 * sd, fmt="o", color=BLUE, ms=3.5, lw=1)
     if found is not None and found.is_useful:
         p = np.linspace(0.0, 0.97 * found.critical, 200)
-        grown = (found.linear + found.imperfection / (found.critical - p)) * p
+        grown = found.imperfection * p / (found.critical - p) + np.polyval(found.others, p)
         top = 1.3 * float(np.abs(amplitude).max())
         axes.plot(100 * p, 1e3 * np.where(np.abs(grown) < top, grown, np.nan), color=MUTED, lw=1)
         _interval(axes, found)
@@ -124,11 +124,11 @@ def draw_amplitude(test: WatchedTest, found: Prediction | None) -> Figure:
 
 
 def draw_growth(test: WatchedTest, found: Prediction) -> Figure:
-    """Draw strain over amplitude, less its linear part: a line that ends at the critical strain."""
-    strain, amplitude, sd = test.columns
-    own = np.sign(found.imperfection) * (amplitude - found.linear * strain)
+    """Draw strain over the critical mode's amplitude: a line that ends at the critical strain."""
+    strain, amplitude, sd, _ = test.columns
+    own = np.sign(found.imperfection) * (amplitude - np.polyval(found.others, strain))
     good = (strain > 0) & (own > 2 * sd) & (own > 0.1 * own.max(initial=0.0))
-    drawn, axes = curve("nominal strain [%]", "strain / (v₁ − c · strain) [1/mm]")
+    drawn, axes = curve("nominal strain [%]", "strain / critical part of v₁ [1/mm]")
     value = strain[good] / own[good]
     axes.errorbar(100 * strain[good], value, 2 * value * sd[good] / own[good], fmt="o",
                   color=BLUE, ms=3.5, lw=1)  # fmt: skip

@@ -31,6 +31,7 @@ from modeharvest.idic.photograph.material import find_material, window_for
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
+from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, binned
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
@@ -71,8 +72,8 @@ class WatchedTest:
     """What is known so far of a test that is watched."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    """Of each photograph: ``name``, ``strain``, ``amplitude_mm``, ``sd_mm``, ``pattern_px`` (rms of
-    v1 phi1), ``seconds``."""
+    """Of each photograph: ``name``, ``strain``, ``amplitude_mm``, its standard deviations ``sd_mm``
+    by noise and ``model_sd_mm``, ``pattern_px`` (rms of v1 phi1), ``seconds``."""
     skipped: list[dict[str, str]] = field(default_factory=list)
     """``name`` and ``reason``."""
     conclusion: str = ""
@@ -89,8 +90,8 @@ class WatchedTest:
 
     @property
     def columns(self) -> FloatArray:
-        """(3, n) strains [-], amplitudes and their standard deviations [mm]."""
-        keys = "strain", "amplitude_mm", "sd_mm"
+        """(4, n) strains [-], amplitudes and their standard deviations [mm]."""
+        keys = "strain", "amplitude_mm", "sd_mm", "model_sd_mm"
         return np.array([[row[key] for row in self.rows] for key in keys])
 
     @property
@@ -159,7 +160,7 @@ class QuickMeasurement:
         """
         begin = time.perf_counter()
         frame = require_alike(self.reference, read_photograph(path))
-        image, mask, grid = self._few
+        image, mask, grid, noise = self._few
         pair = ImagePair(image, binned(frame.image, None, self.factor)[0], grid, mask)
         result = self._from_the_last(pair)
         if result is None or result.outcome in ASTRAY:
@@ -169,22 +170,22 @@ class QuickMeasurement:
         a = result.unknowns
         self._before = (a, a if self._before is None else self._before[0])
         cellular = self.geometry.region.cellular
-        amplitude, sd = half_wave(result, cellular)
+        amplitude, sd, model_sd = half_wave(result, cellular, noise)
         few = self.grid.binned(max(1, round(self._cell_px / 8)))
         inside = cellular.contains(*np.meshgrid(few.x, few.y))
         pattern = result.fluctuation(0, few)[inside] / self.grid.pixel_size
         self.thumbnail = pair.deformed
         strain = mean_strain(result, cellular)[0]
         row = {"name": path.name, "strain": strain, "amplitude_mm": amplitude, "sd_mm": sd}
-        row["pattern_px"] = float(np.sqrt(np.mean(pattern**2)))
+        row |= {"model_sd_mm": model_sd, "pattern_px": float(np.sqrt(np.mean(pattern**2)))}
         return row | {"seconds": time.perf_counter() - begin}
 
     @cached_property
-    def _few(self) -> tuple[FloatImage, BoolArray, PixelGrid]:
-        """The reference binned, whole pixels of its material, and their grid."""
+    def _few(self) -> tuple[FloatImage, BoolArray, PixelGrid, float]:
+        """The reference binned, whole pixels of its material, their grid, noise [grey levels]."""
         image, _ = binned(self.reference.image, None, self.factor)
-        share = binned(self.reference.image, self.geometry.mask, self.factor)[1]
-        return image, share > 0.99, self.grid.binned(self.factor)
+        mask = binned(self.reference.image, self.geometry.mask, self.factor)[1] > 0.99
+        return image, mask, self.grid.binned(self.factor), estimated_noise(image, mask).sd
 
     def _from_the_last(self, pair: ImagePair) -> Result | None:
         """From where the last two photographs point to; None for the first."""
