@@ -81,7 +81,7 @@ _CONTOURS = (
 )
 CUT = (
     "Not all of the specimen is in view: what holds it where the picture cuts it isn't known, so "
-    "that nothing is said within a hole's distance of there."
+    "that nothing is said within about a cell of there."
 )
 _DOTS = (
     "{} dots are on the material: what its edges surround of less than a sixth of the largest "
