@@ -96,8 +96,8 @@ _ALIKE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class PlainSurface:
-    """A picture of two grey levels."""
+class MaterialContours:
+    """Contours of the material in a picture: of two grey levels, or with speckle on it."""
 
     mask: BoolArray
     """(rows, cols) True on material."""
@@ -132,7 +132,7 @@ class PlainSurface:
 
 def plain_surface(
     image: FloatImage, like: BoolArray | None = None, dot_px2: float | None = None
-) -> PlainSurface | None:
+) -> MaterialContours | None:
     """What a picture (rows, cols) shows if it shows a plain material; None if it has speckle.
 
     Of several specimens the largest is taken, or the one where ``like`` is True. One that reaches
@@ -153,7 +153,7 @@ def plain_surface(
     contours, cut = contours_around(grey - middle, material)
     if not contours:
         return None
-    if is_part := PlainSurface(material, (), 0.0, cut=cut).is_part:
+    if is_part := MaterialContours(material, (), 0.0, cut=cut).is_part:
         text += (CUT,)
     contours, dots, most = _without_dots(contours, 0 if is_part else 1, dot_px2)
     if dots:
@@ -169,7 +169,7 @@ def plain_surface(
     marks = tuple(_unbent(Contour(points), variance) for points in dots)
     # Noise and grey level are those beside dots, which are material all the same.
     mask = _filled(material, most) if dots else material
-    return PlainSurface(mask, sharp, noise / slope**2, text, ends, marks)
+    return MaterialContours(mask, sharp, noise / slope**2, text, ends, marks)
 
 
 def _without_dots(
@@ -328,7 +328,7 @@ class MatchedContours:
 
 
 def matched_contours(
-    reference: PlainSurface, deformed: PlainSurface, grid: PixelGrid
+    reference: MaterialContours, deformed: MaterialContours, grid: PixelGrid
 ) -> MatchedContours:
     """Find each contour of a picture again in another one.
 
@@ -452,7 +452,7 @@ def _laid_over(a: FloatArray, b: FloatArray, reach: float) -> FloatArray:
 
 
 def displacement_of_plain(
-    reference: PlainSurface,
+    reference: MaterialContours,
     image: FloatImage,
     grid: PixelGrid,
     body: Body,
@@ -476,7 +476,7 @@ def displacement_of_plain(
 
 
 def displacement_between(
-    reference: PlainSurface, deformed: PlainSurface, grid: PixelGrid, body: Body,
+    reference: MaterialContours, deformed: MaterialContours, grid: PixelGrid, body: Body,
     progress: Progress = silent, before: FloatArray | None = None,
 ) -> tuple[NodalResult, MatchedContours]:  # fmt: skip
     """The displacement between two pictures of which the contours are known, and these.
@@ -546,7 +546,7 @@ def _inner_part(found: NodalResult, mask: BoolArray, reach: float) -> NodalResul
 
 
 def measure_contours(
-    reference: PlainSurface, pair: ImagePair, name: str, geometry: Geometry, cell_size: float,
+    reference: MaterialContours, pair: ImagePair, name: str, geometry: Geometry, cell_size: float,
     how: PhotographOptions, body: Body, progress: Progress = silent,
     before: MeasuredPhotograph | None = None,
 ) -> tuple[MeasuredPhotograph, MatchedContours]:  # fmt: skip

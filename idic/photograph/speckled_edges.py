@@ -25,7 +25,7 @@ from modeharvest.idic.finite_element.system import SAMPLES, Body
 from modeharvest.idic.photograph.geometry import box_of
 from modeharvest.idic.photograph.plain import (
     CUT,
-    PlainSurface,
+    MaterialContours,
     away_from_cuts,
     contours_around,
     displacement_between,
@@ -86,7 +86,7 @@ def body_for_edges(mask: BoolArray, grid: PixelGrid, cell_px: float) -> Body:
     return FiniteElementOptions(2.0 * edge, edge).body(mask & ~slim, grid)
 
 
-def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> PlainSurface:
+def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> MaterialContours:
     """Contours (row, col) of a speckled material in an image (rows, cols); ``mask``: about where.
 
     Their noise is what one of two photographs of the same speckle adds to a displacement's.
@@ -95,7 +95,7 @@ def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> Pla
     share, weight = _share_of_material(np.asarray(image, np.float32), mask)
     found, cut = contours_around(share - 0.5, mask)
     areas = [abs(signed_area(points)) for points in found]
-    seen = PlainSurface(mask, (), 0.0, cut=cut)
+    seen = MaterialContours(mask, (), 0.0, cut=cut)
     holes = areas if seen.is_part else areas[1:]
     least = _LEAST_HOLE * float(np.median(holes)) if holes else 0.0
     kept = [Contour(p) for p, area in zip(found, areas, strict=True) if area >= least]
@@ -178,7 +178,7 @@ def _smoothed(
 
 
 def measure_by_contours(
-    reference: PlainSurface, pair: ImagePair, speckle: Result, cell_size: float, body: Body,
+    reference: MaterialContours, pair: ImagePair, speckle: Result, cell_size: float, body: Body,
     progress: Progress = silent,
 ) -> ByContours:  # fmt: skip
     """Measure a result's ansatz by contours alone; the result is where iterations start.

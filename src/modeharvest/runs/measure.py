@@ -50,7 +50,7 @@ from modeharvest.idic.photograph.displacement import (
 from modeharvest.idic.photograph.gauges import points_of, read_gauges, reading_rows, write_gauges
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain import (
-    PlainSurface,
+    MaterialContours,
     displacement_of_plain,
     plain_surface,
     write_shapes,
@@ -157,7 +157,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         return None if self.case.mask is None else read_mask(self.case.mask)
 
     @cached_property
-    def plain(self) -> PlainSurface | None:
+    def plain(self) -> MaterialContours | None:
         """The reference's contours where it has no speckle; None if it has, or is masked."""
         of_images = self.case.mask is self.case.mesh is None
         return plain_surface(self.reference.image) if of_images else None

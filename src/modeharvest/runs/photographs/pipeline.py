@@ -45,7 +45,7 @@ from modeharvest.idic.photograph.measure import (
     with_brightness,
 )
 from modeharvest.idic.photograph.plain import (
-    PlainSurface,
+    MaterialContours,
     away_from_cuts,
     measure_contours,
     plain_surface,
@@ -282,7 +282,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             return {}, {}
 
         @cache
-        def reference() -> tuple[PlainSurface, Body]:
+        def reference() -> tuple[MaterialContours, Body]:
             mask = self.prepared.mask()
             edges = edges_of_speckled(self.prepared.image(), mask, cell_px)
             return edges, body_for_edges(mask, grid, cell_px)
@@ -316,7 +316,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         return replace(found, errors=self._covariance(found, pair))
 
     @cached_property
-    def _plain(self) -> PlainSurface | None:
+    def _plain(self) -> MaterialContours | None:
         """What the reference shows if the specimen has no speckle."""
         if not self.prepared.is_plain:
             return None
@@ -328,7 +328,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         return plain_surface(self.prepared.image())
 
     def _by_contours(
-        self, name: str, plain: PlainSurface, before: MeasuredPhotograph | None
+        self, name: str, plain: MaterialContours, before: MeasuredPhotograph | None
     ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
         """A photograph that was measured by its contours, and the files of that."""
         case, (body, _) = self.case, self._mesh
