@@ -242,8 +242,8 @@ _OVERLAP = 0.5
 
 
 _FEW = (
-    "The pattern is {:.1f} cells across in view: on fewer than {} its wave vectors and a1 are off "
-    "by percents, and v1 with them, more than error bars say; take more of it into view."
+    "The pattern is {:.1f} cells across in view: on fewer than {} its wave vectors, a1 and v1 are "
+    "off by percents; take more of it into view."
 )
 
 
