@@ -307,10 +307,8 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     def _correlated_again(self, pair: ImagePair, known: Result) -> Result:
         """A result's ansatz on other pixels of the reference, from there on, with errors."""
-        (ansatz, a), how = (
-            with_brightness(known, self.case.correlation),
-            self.case.correlation.options(),
-        )
+        table = self.case.correlation
+        (ansatz, a), how = with_brightness(known, table), table.options()
         how = replace(how, levels=how.levels[-1:])
         found = correlate(pair, ansatz, guess=a, options=how, progress=self.progress)
         return replace(found, errors=self._covariance(found, pair))

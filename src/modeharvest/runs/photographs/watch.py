@@ -63,6 +63,7 @@ _CAREFUL = replace(_QUICK, levels=(Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), 
 _SETTLED_S, _GIVEN_UP_S = 0.3, 10.0
 """A file that hasn't changed for so long is whole; one that can't be read for so long won't be."""
 _POLL_S = 0.2
+_COLUMNS = "strain", "amplitude_mm", "sd_mm", "model_sd_mm"
 _PAGE_S = 2.0
 """Between two pages [s] while photographs are waiting."""
 
@@ -91,8 +92,7 @@ class WatchedTest:
     @property
     def columns(self) -> FloatArray:
         """(4, n) strains [-], amplitudes and their standard deviations [mm]."""
-        keys = "strain", "amplitude_mm", "sd_mm", "model_sd_mm"
-        return np.array([[row[key] for row in self.rows] for key in keys])
+        return np.array([[row[key] for row in self.rows] for key in _COLUMNS])
 
     @property
     def predictions(self) -> list[Prediction | None]:
@@ -245,7 +245,7 @@ def watch(
     with exclusive(folder):
         measuring = QuickMeasurement(found)
         files = sha256_of(measuring.reference.path), str(where.absolute())
-        key = digest(["periodic modes", found.plain(), *files])
+        key = digest(["periodic modes", _COLUMNS, found.plain(), *files])
         test = WatchedTest.read(folder / "watch.json", key)
         drawn = 0.0
 
