@@ -236,7 +236,9 @@ def main() -> None:
                         f"{100 * least:.1f} % of it)")  # fmt: skip
         print("  ".join(line), flush=True)
     for share in (s for s in ASKED if s <= given.last):
-        off, holds, useful = (np.array(of) for of in zip(*(f[1:] for f in found if f[0] == share)))
+        off, holds, useful = (
+            np.array(of) for of in zip(*(f[1:] for f in found if f[0] == share), strict=True)
+        )
         off -= 1.0
         said = off[useful]
         print(
