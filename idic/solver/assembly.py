@@ -20,12 +20,13 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.solver.passes import (
+    NOT_WARPED,
     Runs,
+    Warped,
     accumulate,
     push_forward_rows,
     runs_of,
     tables_of,
-    warp_pass,
 )
 from modeharvest.idic.solver.pixel_blocks import IMAGES, Target
 from modeharvest.imaging.grid import PixelGrid
@@ -180,11 +181,19 @@ class Assembly:
         pairs, degrees = self._pairs(with_matrix, target.component), self._degrees
         top = max(int(pairs[:, 2].max()), *degrees) + 1
         moments = np.zeros((BANDS, len(pairs), top, top))
-        left = np.zeros(BANDS, dtype=np.int64)
-        tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
-        in_parallel(accumulate, target, runs, tables, pairs, len(degrees), moments, left)
-        off = int(left.sum())
+        off = self.pass_over(a, target, runs, pairs, len(degrees), moments)
         return self._from_moments(pairs, moments.sum(axis=0), runs.pixels - off, off)
+
+    def pass_over(
+        self, a: FloatArray, target: Target, runs: Runs, pairs: NDArray[np.int64], fields: int,
+        moments: FloatArray, warped: Warped = NOT_WARPED,
+    ) -> int:  # fmt: skip
+        """Fill the moments or ``warped`` by :func:`accumulate`; how many pixels left the image."""
+        outside = np.zeros(BANDS, dtype=np.int64)
+        tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
+        warped = warped._replace(valid=readable(warped.valid))
+        in_parallel(accumulate, target, runs, tables, pairs, fields, moments, outside, warped)
+        return int(outside.sum())
 
     def _from_moments(
         self, pairs: NDArray[np.int64], moments: FloatArray, used: int, off: int
@@ -227,9 +236,8 @@ def valid_pixels(
     Returns (rows, cols) True on those kept of the assembly's, ``valid`` being where g may be
     sampled, and the number of the others that are mapped outside the deformed image.
     """
-    kept = assembly.mask.copy()
-    nothing = np.zeros((0, 0, 0), dtype=np.float32)
-    return kept, _warp(assembly, a, reference, deformed, nothing, valid, kept)
+    warped = NOT_WARPED._replace(valid=valid, kept=assembly.mask.copy())
+    return warped.kept, _warp(assembly, a, reference, deformed, warped)
 
 
 def residual(
@@ -237,7 +245,7 @@ def residual(
 ) -> NDArray[np.float32]:
     """(rows, cols) f - (1 + b) g(x + u) - c; NaN where no pixel counts or g doesn't reach."""
     left = np.full((1, *assembly.grid.shape), np.nan, dtype=np.float32)
-    _warp(assembly, a, reference, deformed, left)
+    _warp(assembly, a, reference, deformed, NOT_WARPED._replace(fields=left))
     return np.asarray(left[0])
 
 
@@ -249,7 +257,7 @@ def warped_back(
     The gradient in [grey levels/mm]; 0, and f, where no pixel counts or g doesn't reach.
     """
     found = np.zeros((3, *assembly.grid.shape), dtype=np.float32)
-    _warp(assembly, a, reference, deformed, found)
+    _warp(assembly, a, reference, deformed, NOT_WARPED._replace(fields=found))
     np.subtract(reference, found[2], out=found[2])
     return found
 
@@ -262,11 +270,9 @@ def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32])
     """
     everywhere = Assembly(assembly.ansatz, assembly.grid, np.ones(assembly.grid.shape, np.bool_))
     u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)
-    _warp(everywhere, a, slopes[0], SplineImage.of(np.zeros((2, 2))), u)
+    image = SplineImage.of(np.zeros((2, 2)))
+    _warp(everywhere, a, slopes[0], image, NOT_WARPED._replace(fields=u))
     in_parallel(push_forward_rows, u, slopes, assembly.grid.pixel_size)
-
-
-_NOTHING = np.zeros((0, 0), dtype=np.bool_)
 
 
 def _warp(
@@ -274,16 +280,11 @@ def _warp(
     a: FloatArray,
     reference: NDArray[Any],
     deformed: SplineImage,
-    left: NDArray[np.float32],
-    valid: BoolArray = _NOTHING,
-    kept: BoolArray = _NOTHING,
+    warped: Warped,
 ) -> int:
-    """Fill ``left`` or ``kept`` as :func:`warp_pass` does; how many pixels are mapped outside."""
-    ansatz, outside = assembly.ansatz, np.zeros(BANDS, dtype=np.int64)
-    tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
+    """Fill what is to be left of each pixel; how many are mapped outside the image."""
+    ansatz, no_pairs = assembly.ansatz, np.zeros((0, 3), dtype=np.int64)
     target = Target.images(reference, deformed, assembly.grid)
     degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
-    in_parallel(
-        warp_pass, target, assembly.runs, tables, degree, readable(valid), kept, left, outside
-    )
-    return int(outside.sum())
+    moments = np.zeros((BANDS, 0, degree + 1, degree + 1))
+    return assembly.pass_over(a, target, assembly.runs, no_pairs, 3, moments, warped)

@@ -67,51 +67,6 @@ def push_forward_rows(u: Any, slopes: Any, pixel_size: float, first: int, every:
                 slopes[1, i, j] = (xx * s_y - xy * s_x) / det
 
 
-@compiled(relaxed=True)
-def warp_pass(
-    target: Any, runs: Any, tables: Any, degree: int, valid: Any, kept: Any, left: Any,
-    outside: Any, first: int, every: int,
-) -> None:  # fmt: skip
-    """Fill ``kept`` from ``valid``, or else ``left``: one pass, so that it is compiled once.
-
-    ``left`` takes the residual alone, the displacement of whole rows, or slopes and residual.
-    """
-    rows, per_px, bands = runs.row_start.size - 1, 1.0 / target.pixel_size, outside.size
-    for band in range(first, bands, every):
-        block = new_block(tables, degree, 3)
-        own, E = block.own, block.E
-        for row in range(band * rows // bands, (band + 1) * rows // bands):
-            run, begin = start_row(runs, tables, row, block)
-            while run < runs.row_start[row + 1]:
-                n, run, begin = take_block(target, runs, tables, row, run, begin, block)
-                displace_block(row, n, tables, block)
-                if kept.size:
-                    map_block(row, n, per_px, own)
-                    outside[band] += _mark_valid(n, own, valid, kept[row])
-                elif left.shape[0] == 2:
-                    for k in range(2):
-                        for m in range(n):
-                            left[k, row, int(own[COLUMN, m])] = own[U_X + k, m]
-                else:
-                    sample_block(target, row, n, block)
-                    for k in range(left.shape[0]):
-                        for m in range(n):
-                            if own[WEIGHT, m] > 0.0:
-                                at = int(own[COLUMN, m])
-                                left[k, row, at] = E[k + 3 - left.shape[0], m]
-
-
-@compiled(relaxed=True)
-def _mark_valid(n: int, own: Any, valid: Any, kept: Any) -> int:
-    last_row, last_col, outside = valid.shape[0] - 1, valid.shape[1] - 1, 0
-    for m in range(n):
-        row, col = own[AT_ROW, m], own[AT_COL, m]
-        inside = 0 <= row <= last_row and 0 <= col <= last_col
-        outside += not inside
-        kept[int(own[COLUMN, m])] = inside and valid[int(np.rint(row)), int(np.rint(col))]
-    return outside
-
-
 class Runs(NamedTuple):
     """The pixels that count, as runs of neighbours along the rows."""
 
@@ -264,24 +219,63 @@ def _add_row(pairs: Any, row_moments: Any, eta_T: Any, moments: Any) -> None:
                 moments[p, a, b] += value * eta_T[b]
 
 
+class Warped(NamedTuple):
+    """What a pass leaves of each pixel instead of moments; all of it is empty where it isn't."""
+
+    valid: NDArray[Any]
+    kept: NDArray[Any]
+    """(rows, cols): where g may be sampled, and which pixels are mapped there, to be filled."""
+    fields: NDArray[Any]
+    """(k, rows, cols), to be filled: the residual if k is 1, u if it is 2, if it is 3 slopes and
+    residual."""
+
+
+NOT_WARPED = Warped(*np.zeros((2, 0, 0), dtype=np.bool_), np.zeros((0, 0, 0), dtype=np.float32))
+
+
+@compiled(relaxed=True)
+def _mark_valid(n: int, own: Any, valid: Any, kept: Any) -> int:
+    last_row, last_col, outside = valid.shape[0] - 1, valid.shape[1] - 1, 0
+    for m in range(n):
+        row, col = own[AT_ROW, m], own[AT_COL, m]
+        inside = 0 <= row <= last_row and 0 <= col <= last_col
+        outside += not inside
+        kept[int(own[COLUMN, m])] = inside and valid[int(np.rint(row)), int(np.rint(col))]
+    return outside
+
+
+@compiled(relaxed=True)
+def _leave_block(row: int, n: int, own: Any, E: Any, fields: Any) -> None:
+    """Fill rows of the fields that are left, in turn those of u or those of E that are last."""
+    for k in range(fields.shape[0]):
+        values = own[U_X + k] if fields.shape[0] == 2 else E[k + 3 - fields.shape[0]]
+        for m in range(n):
+            if fields.shape[0] == 2 or own[WEIGHT, m] > 0.0:
+                fields[k, row, int(own[COLUMN, m])] = values[m]
+
+
 @compiled(relaxed=True)
 def accumulate(
-    target: Any, runs: Any, tables: Any, pairs: Any, fields: int, moments: Any, left: Any,
-    first: int, every: int,
+    target: Any, runs: Any, tables: Any, pairs: Any, fields: int, moments: Any, outside: Any,
+    warped: Any, first: int, every: int,
 ) -> None:  # fmt: skip
     """Sum the moments of pairs of base fields over the pixels of some bands of rows.
 
+    One pass for all that is wanted of the pixels, so that it is compiled once.
+
     target, runs, tables : :class:`Target`, :class:`Runs` and :class:`Tables`.
-    pairs : (pairs, 3): numbers of two base fields and the sum of their degrees.
+    pairs : (pairs, 3): numbers of two base fields and the sum of their degrees; none where what
+        is wanted is ``warped``.
     fields : Number of base fields.
-    moments, left : (bands, pairs, K + 1, K + 1) sums of each band of rows, and (bands,) how many
-        pixels are mapped outside the image; both zero on entry.
+    moments, outside : (bands, pairs, K + 1, K + 1) sums of each band of rows, and (bands,) how
+        many pixels are mapped outside the image; both zero on entry.
+    warped : :class:`Warped`, to be filled.
     first, every : The bands to look at: each ``every``-th from ``first`` on.
     """
     rows, bands = runs.row_start.size - 1, moments.shape[0]
     for band in range(first, bands, every):
         block = new_block(tables, max(1, moments.shape[2] - 1), fields)
-        product = np.empty(BLOCK)
+        own, E, product = block.own, block.E, np.empty(BLOCK)
         row_moments = np.zeros((pairs.shape[0], moments.shape[2]))
         for row in range(band * rows // bands, (band + 1) * rows // bands):
             if runs.row_start[row] == runs.row_start[row + 1]:
@@ -290,7 +284,16 @@ def accumulate(
             while run < runs.row_start[row + 1]:
                 n, run, begin = take_block(target, runs, tables, row, run, begin, block)
                 displace_block(row, n, tables, block)
-                left[band] += sample_block(target, row, n, block)
-                _base_fields_block(n, tables, block)
-                _moments_block(n, pairs, block.T, block.E, product, row_moments)
+                if warped.kept.size:
+                    map_block(row, n, 1.0 / target.pixel_size, own)
+                    outside[band] += _mark_valid(n, own, warped.valid, warped.kept[row])
+                elif warped.fields.shape[0] == 2:
+                    _leave_block(row, n, own, E, warped.fields)
+                else:
+                    outside[band] += sample_block(target, row, n, block)
+                    if warped.fields.size:
+                        _leave_block(row, n, own, E, warped.fields)
+                    else:
+                        _base_fields_block(n, tables, block)
+                        _moments_block(n, pairs, block.T, E, product, row_moments)
             _add_row(pairs, row_moments, block.eta_T, moments[band])
