@@ -95,7 +95,7 @@ def _mirrored(poles: FloatArray, n: int) -> FloatArray:
     return np.asarray(weights / (1.0 - z ** (2 * n - 2)))
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _filter(lines: Any, n: int, poles: Any, first: Any, gain: float) -> None:
     """Filter lines[:n, :] along its first axis, all of its columns side by side."""
     width = lines.shape[1]

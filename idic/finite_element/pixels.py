@@ -334,7 +334,7 @@ def accumulate_elements(
                 _add_products(n, N, own, h, blocks[e])
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _shapes(xi: Any, begin: int, n: int, N: Any) -> None:
     """Fill the shape functions of a T6 element (6, n)."""
     for m in range(n):
@@ -344,7 +344,7 @@ def _shapes(xi: Any, begin: int, n: int, N: Any) -> None:
         N[3, m], N[4, m], N[5, m] = 4.0 * r * s, 4.0 * s * t, 4.0 * t * r
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _map(pixels: Any, begin: int, n: int, N: Any, u: Any, pixel_size: float, own: Any) -> None:
     """Fill where a block's pixels are in the deformed image, row and column."""
     at_row, at_col, per_px = own[4], own[5], 1.0 / pixel_size
@@ -357,7 +357,7 @@ def _map(pixels: Any, begin: int, n: int, N: Any, u: Any, pixel_size: float, own
         at_col[m] = pixels.col[begin + m] + right * per_px
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _is_interior(n: int, summed: Any, own: Any) -> bool:
     """Whether all pixels around a block's are those of the deformed image's material."""
     top, left = own[4, :n].min(), own[5, :n].min()
@@ -368,7 +368,7 @@ def _is_interior(n: int, summed: Any, own: Any) -> bool:
     return bool(summed[k, m] - summed[i, m] - summed[k, j] + summed[i, j] == 0)
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _sample(
     pixels: Any, begin: int, n: int, coefficients: Any, order: int, valid: Any, pixel_size: float,
     own: Any, sums: Any,
@@ -389,7 +389,7 @@ def _sample(
         sums[2] += 1.0 - weight[m]
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, own: Any, sums: Any) -> None:
     """Put F^-T grad f in the place of grad g in a block; sum its square and both' product."""
     for m in range(n):
@@ -417,7 +417,7 @@ def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, own: Any, sum
             own[0, m], own[1, m] = h_x, h_y
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _weigh(n: int, outside: Any, variance: float, own: Any) -> None:
     """Weigh what continued pixels make of a block by the inverse of its variance."""
     rows, cols = outside.shape
@@ -435,7 +435,7 @@ def _weigh(n: int, outside: Any, variance: float, own: Any) -> None:
                     own[k, m] *= np.sqrt(own[3, m])
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _add(n: int, N: Any, own: Any, gradient: Any) -> None:
     """Add a block's slopes times residuals to an element's sums."""
     g_x, g_y, residual = own[0], own[1], own[2]
@@ -449,7 +449,7 @@ def _add(n: int, N: Any, own: Any, gradient: Any) -> None:
         gradient[a, 1] += r_y
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _add_products(n: int, N: Any, own: Any, h: Any, blocks: Any) -> None:
     """Add a block's products of slopes to an element's sums."""
     g_x, g_y = own[0], own[1]

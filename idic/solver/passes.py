@@ -152,7 +152,7 @@ def tables_of(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> Tables:
     )  # fmt: skip
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _base_fields_block(n: int, tables: Any, block: Any) -> None:
     """Fill the base fields between the gradient and the residual."""
     E, modes, waves = block.E, block.modes, tables.waves
@@ -175,7 +175,7 @@ def _base_fields_block(n: int, tables: Any, block: Any) -> None:
         copy_block(block.own[WEIGHT], n, E[tables.offset_field])
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _moments_block(n: int, pairs: Any, T: Any, E: Any, product: Any, row_moments: Any) -> None:
     """Add sum e e' T_a over the block to row_moments[pair, a] for a up to the pair's degree."""
     for p in range(pairs.shape[0]):
@@ -207,7 +207,7 @@ def _moments_block(n: int, pairs: Any, T: Any, E: Any, product: Any, row_moments
             a += 1
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _add_row(pairs: Any, row_moments: Any, eta_T: Any, moments: Any) -> None:
     """Multiply the moments of a row by T_b(eta) of that row, and add them."""
     for p in range(pairs.shape[0]):
@@ -233,7 +233,7 @@ class Warped(NamedTuple):
 NOT_WARPED = Warped(*np.zeros((2, 0, 0), dtype=np.bool_), np.zeros((0, 0, 0), dtype=np.float32))
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _mark_valid(n: int, own: Any, valid: Any, kept: Any) -> int:
     last_row, last_col, outside = valid.shape[0] - 1, valid.shape[1] - 1, 0
     for m in range(n):
@@ -244,7 +244,7 @@ def _mark_valid(n: int, own: Any, valid: Any, kept: Any) -> int:
     return outside
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _leave_block(row: int, n: int, own: Any, E: Any, fields: Any) -> None:
     """Fill rows of the fields that are left, in turn those of u or those of E that are last."""
     for k in range(fields.shape[0]):

@@ -105,7 +105,7 @@ class PixelBlock(NamedTuple):
     """(fields, BLOCK) base fields: gx and gy first, the residual last."""
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def new_block(tables: Any, degree: int, fields: int) -> PixelBlock:
     """Make room for a block, with Chebyshev polynomials up to a degree of at least 1."""
     n, w = tables.v.shape[0], tables.waves.shape[0]
@@ -192,7 +192,7 @@ def displace_block(row: int, n: int, tables: Any, block: Any) -> None:
                 u[m] += v[m] * phi[m]
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _chebyshev_block(xi: Any, n: int, T: Any) -> None:
     """T_0 ... T_K along the block."""
     for m in range(n):
@@ -203,7 +203,7 @@ def _chebyshev_block(xi: Any, n: int, T: Any) -> None:
             T[a, m] = 2.0 * T[1, m] * T[a - 1, m] - T[a - 2, m]
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _series_block(C: Any, eta_T: Any, T: Any, n: int, out: Any) -> None:
     """Sum C[a, b] T_a(xi) T_b(eta) along the block; eta_T holds T_b of the row."""
     degree = C.shape[0] - 1
@@ -233,7 +233,7 @@ def _along(C: Any, eta_T: Any, degree: int) -> float:
     return total
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _modes_block(row: int, n: int, tables: Any, X: Any, modes: Any, waves: Any) -> None:
     """phi_i, S sin theta_w and S cos theta_w pi/l along the block, from one-dimensional tables."""
     count = waves.shape[0]

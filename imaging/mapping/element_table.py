@@ -149,7 +149,7 @@ def _tabulate(
         elements.row_to[e] = min(max(int(np.floor(high + 1e-9 + centre[0])) + 1, 0), rows)
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _side(
     elements: ElementTable, e: int, side: int, position_px: FloatArray, cell: IntArray
 ) -> None:
@@ -167,7 +167,7 @@ def _side(
         elements.sides[e, side, i, 2] = bulge
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def proved_reach(polynomial: FloatArray, slopes: FloatArray, centre: float) -> float:
     """How far beyond its edges, in (xi, eta), an element's map is one to one, proved; else 0.
 

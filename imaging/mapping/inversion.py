@@ -80,7 +80,7 @@ def outside(triangular: bool, s: float, t: float) -> float:
     return max(abs(s), abs(t)) - 1.0
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def invert(
     polynomial: FloatArray, triangular: bool, affine: bool, row: FloatArray, col: FloatArray,
     s: FloatArray, t: FloatArray, count: int,
@@ -103,7 +103,7 @@ def invert(
             break
 
 
-@compiled()
+@compiled(inner=True)
 def newton(
     a: Coefficients, b: Coefficients, curved: bool, row: float, col: float, s: float, t: float
 ) -> tuple[bool, float, float]:
@@ -125,7 +125,7 @@ def newton(
     return False, s, t
 
 
-@compiled()
+@compiled(inner=True)
 def _may_hold(
     a: FloatArray, bezier: FloatArray, s: float, t: float, scale: float, row: float, col: float
 ) -> bool:
@@ -158,7 +158,7 @@ def _may_hold(
     return True
 
 
-@compiled()
+@compiled(inner=True)
 def search(
     polynomial: FloatArray, bezier: FloatArray, quarters: FloatArray, triangular: bool, row: float,
     col: float,

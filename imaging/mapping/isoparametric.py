@@ -208,7 +208,7 @@ def _locate(
                 residual[k] = distance_px(x, y, not elements.triangular, s, t, at)
 
 
-@compiled()
+@compiled(inner=True)
 def _owner(
     elements: ElementTable, buckets: _Buckets, row: float, col: float
 ) -> tuple[int, float, float]:

@@ -84,7 +84,7 @@ def rasterise(
         overlapping[band] = fill(elements, fields, pixels, everywhere, visited, top, bottom)
 
 
-@compiled()
+@compiled(inner=True)
 def fill(
     elements: ElementTable, fields: FloatArray, pixels: Pixels, selected: BoolArray,
     visited: IntArray, top: int, bottom: int,

@@ -159,7 +159,7 @@ def _sample(
         sample(table, row[first:past], col[first:past], out[first:past], workspace())
 
 
-@compiled()
+@compiled(inner=True)
 def workspace() -> Workspace:
     """Allocate the arrays that :func:`sample` works in."""
     return Workspace(
@@ -168,7 +168,7 @@ def workspace() -> Workspace:
     )  # fmt: skip
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def sample(
     table: SplineTable, row: FloatArray, col: FloatArray, out: FloatArray, work: Workspace
 ) -> None:
@@ -191,7 +191,7 @@ def sample(
         out[k] = _patch(c, i, j, w, v, k)
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _place(position: FloatArray, finer: float, sample: IntArray, beyond: FloatArray) -> None:
     """Split positions [px] into the sample before them and how far they lie beyond it."""
     for k in range(position.size):
@@ -201,7 +201,7 @@ def _place(position: FloatArray, finer: float, sample: IntArray, beyond: FloatAr
         sample[k] = int(whole) if abs(at) < 2.0**52 else _NOWHERE
 
 
-@compiled(relaxed=True)
+@compiled(inner=True, relaxed=True)
 def _tap_weights(a: FloatArray, t: FloatArray, w: FloatArray) -> None:
     """(8, points) weights of the taps at the fractions t, by Horner's scheme."""
     for m in range(_TAPS):
