@@ -229,8 +229,8 @@ def main() -> None:
             if at is None:
                 line.append(f"{share:.0%} –")
                 continue
-            holds = at.low <= there <= at.high
-            found.append((share, at.critical / there, holds, at.is_useful))
+            is_covered = at.low <= there <= at.high
+            found.append((share, at.critical / there, is_covered, at.is_useful))
             least = least_deviation(columns[:, : at.count], at.imperfection, there)
             line.append(f"{share:.0%} {100 * at.critical:.2f} ({at.interval}; sd at least "
                         f"{100 * least:.1f} % of it)")  # fmt: skip

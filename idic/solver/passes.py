@@ -230,7 +230,8 @@ class Warped(NamedTuple):
     residual."""
 
 
-NOT_WARPED = Warped(*np.zeros((2, 0, 0), dtype=np.bool_), np.zeros((0, 0, 0), dtype=np.float32))
+_NO_PIXELS = np.zeros((0, 0), dtype=np.bool_)
+NOT_WARPED = Warped(_NO_PIXELS, _NO_PIXELS, np.zeros((0, 0, 0), dtype=np.float32))
 
 
 @compiled(inner=True, relaxed=True)
