@@ -240,12 +240,13 @@ def main() -> None:
             np.array(of) for of in zip(*(f[1:] for f in found if f[0] == share), strict=True)
         )
         off -= 1.0
-        said = off[useful]
+        of_use = off[useful]
+        rms = np.sqrt(np.mean(of_use**2))
         print(
             f"at {share:.0%}: of {given.seeds}, within 3 % {(np.abs(off) < 0.03).sum()}, intervals "
             f"hold {holds.sum()}; said to be of use {useful.sum()}, of these median "
-            f"{100 * np.median(said):+.1f} %, rms {100 * np.sqrt(np.mean(said**2)):.1f} %, largest "
-            f"{100 * np.abs(said).max():.1f} %, within 3 % {(np.abs(said) < 0.03).sum()}, "
+            f"{100 * np.median(of_use):+.1f} %, rms {100 * rms:.1f} %, largest "
+            f"{100 * np.abs(of_use).max():.1f} %, within 3 % {(np.abs(of_use) < 0.03).sum()}, "
             f"intervals hold {holds[useful].sum()}"
         )
 

@@ -20,7 +20,6 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.solver.passes import (
-    NOT_WARPED,
     Runs,
     Warped,
     accumulate,
@@ -181,17 +180,16 @@ class Assembly:
         pairs, degrees = self._pairs(with_matrix, target.component), self._degrees
         top = max(int(pairs[:, 2].max()), *degrees) + 1
         moments = np.zeros((BANDS, len(pairs), top, top))
-        off = self.pass_over(a, target, runs, pairs, len(degrees), moments)
+        off = self.pass_over(a, target, runs, pairs, len(degrees), moments, Warped())
         return self._from_moments(pairs, moments.sum(axis=0), runs.pixels - off, off)
 
     def pass_over(
         self, a: FloatArray, target: Target, runs: Runs, pairs: NDArray[np.int64], fields: int,
-        moments: FloatArray, warped: Warped = NOT_WARPED,
+        moments: FloatArray, warped: Warped,
     ) -> int:  # fmt: skip
         """Fill the moments or ``warped`` by :func:`accumulate`; how many pixels left the image."""
-        outside = np.zeros(BANDS, dtype=np.int64)
+        warped, outside = warped._replace(valid=readable(warped.valid)), np.zeros(BANDS, np.int64)
         tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
-        warped = warped._replace(valid=readable(warped.valid))
         in_parallel(accumulate, target, runs, tables, pairs, fields, moments, outside, warped)
         return int(outside.sum())
 
@@ -236,7 +234,7 @@ def valid_pixels(
     Returns (rows, cols) True on those kept of the assembly's, ``valid`` being where g may be
     sampled, and the number of the others that are mapped outside the deformed image.
     """
-    warped = NOT_WARPED._replace(valid=valid, kept=assembly.mask.copy())
+    warped = Warped(valid=valid, kept=assembly.mask.copy())
     return warped.kept, _warp(assembly, a, reference, deformed, warped)
 
 
@@ -245,7 +243,7 @@ def residual(
 ) -> NDArray[np.float32]:
     """(rows, cols) f - (1 + b) g(x + u) - c; NaN where no pixel counts or g doesn't reach."""
     left = np.full((1, *assembly.grid.shape), np.nan, dtype=np.float32)
-    _warp(assembly, a, reference, deformed, NOT_WARPED._replace(fields=left))
+    _warp(assembly, a, reference, deformed, Warped(fields=left))
     return np.asarray(left[0])
 
 
@@ -257,7 +255,7 @@ def warped_back(
     The gradient in [grey levels/mm]; 0, and f, where no pixel counts or g doesn't reach.
     """
     found = np.zeros((3, *assembly.grid.shape), dtype=np.float32)
-    _warp(assembly, a, reference, deformed, NOT_WARPED._replace(fields=found))
+    _warp(assembly, a, reference, deformed, Warped(fields=found))
     np.subtract(reference, found[2], out=found[2])
     return found
 
@@ -270,18 +268,14 @@ def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32])
     """
     everywhere = Assembly(assembly.ansatz, assembly.grid, np.ones(assembly.grid.shape, np.bool_))
     u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)
-    image = SplineImage.of(np.zeros((2, 2)))
-    _warp(everywhere, a, slopes[0], image, NOT_WARPED._replace(fields=u))
+    _warp(everywhere, a, slopes[0], SplineImage.of(np.zeros((2, 2))), Warped(fields=u))
     in_parallel(push_forward_rows, u, slopes, assembly.grid.pixel_size)
 
 
 def _warp(
-    assembly: Assembly,
-    a: FloatArray,
-    reference: NDArray[Any],
-    deformed: SplineImage,
+    assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage,
     warped: Warped,
-) -> int:
+) -> int:  # fmt: skip
     """Fill what is to be left of each pixel; how many are mapped outside the image."""
     ansatz, no_pairs = assembly.ansatz, np.zeros((0, 3), dtype=np.int64)
     target = Target.images(reference, deformed, assembly.grid)

@@ -219,19 +219,20 @@ def _add_row(pairs: Any, row_moments: Any, eta_T: Any, moments: Any) -> None:
                 moments[p, a, b] += value * eta_T[b]
 
 
+_NOWHERE = np.zeros((0, 0), dtype=np.bool_)
+
+
 class Warped(NamedTuple):
-    """What a pass leaves of each pixel instead of moments; all of it is empty where it isn't."""
+    """What a pass leaves of each pixel instead of moments; empty where there is nothing to leave.
 
-    valid: NDArray[Any]
-    kept: NDArray[Any]
-    """(rows, cols): where g may be sampled, and which pixels are mapped there, to be filled."""
-    fields: NDArray[Any]
-    """(k, rows, cols), to be filled: the residual if k is 1, u if it is 2, if it is 3 slopes and
-    residual."""
+    ``valid`` tells where g may be sampled; which pixels are mapped there is filled into ``kept``
+    (both (rows, cols)), into ``fields`` (k, rows, cols) the residual if k is 1, u if it is 2, if it
+    is 3 slopes and residual.
+    """
 
-
-_NO_PIXELS = np.zeros((0, 0), dtype=np.bool_)
-NOT_WARPED = Warped(_NO_PIXELS, _NO_PIXELS, np.zeros((0, 0, 0), dtype=np.float32))
+    valid: NDArray[Any] = _NOWHERE
+    kept: NDArray[Any] = _NOWHERE
+    fields: NDArray[Any] = np.zeros((0, 0, 0), dtype=np.float32)
 
 
 @compiled(inner=True, relaxed=True)
@@ -262,15 +263,12 @@ def accumulate(
 ) -> None:  # fmt: skip
     """Sum the moments of pairs of base fields over the pixels of some bands of rows.
 
-    One pass for all that is wanted of the pixels, so that it is compiled once.
-
     target, runs, tables : :class:`Target`, :class:`Runs` and :class:`Tables`.
-    pairs : (pairs, 3): numbers of two base fields and the sum of their degrees; none where what
-        is wanted is ``warped``.
+    pairs : (pairs, 3): numbers of two base fields and the sum of their degrees.
     fields : Number of base fields.
     moments, outside : (bands, pairs, K + 1, K + 1) sums of each band of rows, and (bands,) how
         many pixels are mapped outside the image; both zero on entry.
-    warped : :class:`Warped`, to be filled.
+    warped : :class:`Warped`, to be filled instead if it isn't empty, by the same compiled pass.
     first, every : The bands to look at: each ``every``-th from ``first`` on.
     """
     rows, bands = runs.row_start.size - 1, moments.shape[0]

@@ -30,10 +30,9 @@ def compiled(
 ) -> Callable[[F], F]:
     """Compile a kernel at its first call; the machine code is cached on disk, if that is allowed.
 
-    ``inner``: only kernels call it, so what Python would need to is not compiled: a sixth of the
-    time of all. ``inline``: the same, and its code is put into theirs. ``relaxed``: let the
-    compiler reorder sums and divide as numpy does; by default floating-point arithmetic is strict,
-    and division by zero an error.
+    ``inner``: for kernels only, without what Python needs to call it. ``inline``: the same, and put
+    into their code. ``relaxed``: let the compiler reorder sums and divide as numpy does; by default
+    floating-point arithmetic is strict, and division by zero an error.
     """
     options: dict[str, Any] = {"forceinline": inline, "nogil": True, "no_cfunc_wrapper": True}
     options["no_cpython_wrapper"] = inner or inline
