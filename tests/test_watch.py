@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -203,6 +204,22 @@ def test_it_goes_on_where_it_stopped(watched: tuple[Path, WatchedTest], experime
     again = watch(experiment, out, until_still=0.1)
     assert [row["seconds"] for row in again.rows] == seconds
     assert again.skipped == test.skipped
+
+
+def test_what_a_version_with_other_columns_left_is_measured_again(
+    watched: tuple[Path, WatchedTest],
+    experiment: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def show(line: str) -> None:
+        raise KeyboardInterrupt
+
+    shutil.copytree(watched[0], tmp_path / "out")
+    columns = ("strain", "amplitude_mm", "sd_mm", "sd_mm")
+    monkeypatch.setattr("modeharvest.runs.photographs.watch._COLUMNS", columns)
+    again = watch(experiment, tmp_path / "out", until_still=0.1, show=show)
+    assert len(again.rows) == 1
 
 
 def test_a_file_half_written_is_waited_for(tmp_path: Path) -> None:
