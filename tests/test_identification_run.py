@@ -239,7 +239,7 @@ def test_displacements_of_the_ansatz_beside_the_model(tmp_path: Path) -> None:
         assert p["sd_with_model_error"] < 1e-3
     assert summary["model_error"]["p_value"] > 1e-3
     assert faults(summary, "identify") == []
-    alone = run_identification(tables, tmp_path / "alone")
+    alone = run_identification(tables, tmp_path / "known")  # of the same images
     assert alone["states"][1]["residual_rms"] > 1.2 * alone["states"][1]["residual_noise"]
 
 
@@ -275,13 +275,14 @@ def test_images_of_the_other_branch_are_noticed(tmp_path: Path) -> None:
     experiment = {"specimen": SMALL, "strains": [0.1], "mesh_size": 0.55}
     twin = BEFORE["twin"] | {"tilt": 0.01}
     other = BEFORE | {"experiment": experiment | {"branches": ["buckled-"]}, "twin": twin}
-    true = run_identification(other, tmp_path / "true")
-    images = ImageSet.read(tmp_path / "true" / "images")
+    true = IdentificationRun(IdentificationCase.model_validate(other), tmp_path)
+    true._make_twin(true.case.twin)
+    images = ImageSet.read(tmp_path / "images")
     records = images.info["reference"], *images.info["snapshots"]
     for name, record in zip("fg", records, strict=True):
         image = read_image(images.folder / record["camera_image"])
         write_image(tmp_path / f"{name}.tif", image)
-    readings = json.loads((tmp_path / "true" / "forces.json").read_text("utf-8"))
+    readings = json.loads((tmp_path / "forces.json").read_text("utf-8"))
     data = {"reference": "f.tif", "deformed": ["g.tif"], "pixel_size": 0.05,
             "force_sd": 0.002, **readings}  # fmt: skip
     tables = {key: value for key, value in BEFORE.items() if key not in ("twin", "imaging")}
@@ -290,9 +291,10 @@ def test_images_of_the_other_branch_are_noticed(tmp_path: Path) -> None:
     found = run_identification(case, tmp_path / "found")
     assert "the specimen is on buckled-: on buckled+ the model fits worse" in found["statements"]
     assert [s["branch"] for s in found["states"]] == ["buckled-"]
-    assert found["warnings"] == true["warnings"] == []
-    for p, same in zip(found["parameters"][:3], true["parameters"], strict=True):
-        assert abs(p["value"] - same["value"]) < p["sd"]  # which has the place as unknowns, too
+    assert found["warnings"] == []
+    ogden = Ogden()
+    for p, value in zip(found["parameters"], (ogden.moduli[0], ogden.kappa, 0.01), strict=False):
+        assert abs(p["value"] - value) < 4.0 * p["sd_with_model_error"]
 
 
 NEVER = float("nan")
