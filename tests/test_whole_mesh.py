@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from plate_with_hole import GRID, HALF_SIZE, RADIUS, is_material
@@ -40,6 +43,16 @@ def test_mesh_covers_the_mask() -> None:
     covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask
     assert (PLATE & ~covered).sum() < 0.002 * PLATE.sum()
     assert (covered & ~PLATE).sum() < 0.01 * PLATE.sum()
+
+
+def test_a_library_that_gmsh_lacks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    what = "libGLU.so.1: cannot open shared object file"
+    (tmp_path / "gmsh.py").write_text(f"raise OSError({what!r})\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    with pytest.raises(InputError, match=f"got OSError: {what}; install that library, or give a"):
+        mesh_of_mask(PLATE, GRID, 20.0, 10.0)
 
 
 def test_whole_image_without_holes() -> None:

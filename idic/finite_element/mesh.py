@@ -118,8 +118,7 @@ def mesh_of_mask(
     """
     if find_spec("gmsh") is None:
         raise InputError(
-            "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
-            "mesh"
+            "expected gmsh to make a mesh from a mask, got none; 'pip install gmsh', or give a mesh"
         )
     # gmsh is loaded while the boundaries are found.
     with subprocess.Popen(_MESHER, stdin=_PIPE, stdout=_PIPE, stderr=_PIPE) as child:
@@ -167,10 +166,9 @@ def _meshed(
         child.kill()
         failed, got = True, f"none in {seconds:.0f} s"
     if failed:
-        raise InputError(
-            f"expected a mesh within the mask's boundaries from gmsh, got {got}; smooth the mask, "
-            "fill its narrow holes, or give a mesh"
-        )
+        lacks = got.startswith(("OSError: ", "ImportError: "))  # it loads graphics, used or not
+        advice = "install that library" if lacks else "smooth the mask, fill its narrow holes"
+        raise InputError(f"expected gmsh to mesh the mask, got {got}; {advice}, or give a mesh")
     nodes, cells = pickle.loads(found)
     return nodes, cells
 

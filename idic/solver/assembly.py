@@ -169,8 +169,8 @@ class Assembly:
 
         The target is a displacement (rows, cols, 2) [mm].
         """
-        known = (np.asarray(target[..., c], dtype=np.float64) for c in (0, 1))
-        along = (Target.along(c, u, self.grid) for c, u in enumerate(known))
+        known = np.asarray(target, dtype=np.float64)
+        along = (Target.along(c, known[..., c], self.grid) for c in (0, 1))
         x, y = (self._assemble(a, field, with_matrix, self.runs) for field in along)
         return x + y
 
@@ -201,8 +201,7 @@ class Assembly:
         for (e, k, _), moment in zip(pairs, moments, strict=True):
             matrix[parts[e], parts[k]] = _products(moment, degrees[e], degrees[k])
             matrix[parts[k], parts[e]] = matrix[parts[e], parts[k]].T
-        to = self._to_unknowns
-        left = self.outside + off
+        to, left = self._to_unknowns, self.outside + off
         return NormalEquations(
             to.T @ matrix[:-1, :-1] @ to, -to.T @ matrix[:-1, -1], 0.5 * matrix[-1, -1], used, left
         )
@@ -279,6 +278,6 @@ def _warp(
     """Fill what is to be left of each pixel; how many are mapped outside the image."""
     ansatz, no_pairs = assembly.ansatz, np.zeros((0, 3), dtype=np.int64)
     target = Target.images(reference, deformed, assembly.grid)
-    degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
-    moments = np.zeros((BANDS, 0, degree + 1, degree + 1))
+    top = 1 + max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
+    moments = np.zeros((BANDS, 0, top, top))
     return assembly.pass_over(a, target, assembly.runs, no_pairs, 3, moments, warped)

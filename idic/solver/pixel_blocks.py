@@ -66,9 +66,8 @@ class Target(NamedTuple):
     @classmethod
     def along(cls, component: int, displacement: NDArray[Any], grid: PixelGrid) -> Target:
         """One component of a displacement (rows, cols) [mm]: 0 for u_x, 1 for u_y."""
-        nothing = np.zeros((0, 0), dtype=np.float32)
+        nothing, none = np.zeros((0, 0), dtype=np.float32), readable(NO_INSTRUMENT)
         u = readable(displacement)
-        none = readable(NO_INSTRUMENT)
         return cls(component, readable(nothing), nothing, 5, u, none, 1.0, grid.pixel_size)
 
 
@@ -309,9 +308,8 @@ def sample_block(target: Any, row: int, n: int, block: Any) -> int:
     for m in range(n):
         residual[m] = (known[m] - c[m]) * weight[m] - (1.0 + b[m]) * g[m]
     if target.instrument.shape[1]:
-        share = target.share
         for k in range(3):
-            given, to = own[INSTRUMENT + k], (E[k] if k < 2 else g)
+            given, to, share = own[INSTRUMENT + k], (E[k] if k < 2 else g), target.share
             for m in range(n):
                 to[m] = weight[m] * (share * given[m] + (1.0 - share) * to[m])
     return off

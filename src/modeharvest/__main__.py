@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 
@@ -10,6 +11,8 @@ def start() -> None:
     """Load the command line and run it; Ctrl-C may come before there is anything to catch it."""
     if not sys.warnoptions:  # else libraries would print theirs beside our lines
         warnings.simplefilter("ignore")
+    for library in ("OMP", "OPENBLAS", "MKL"):  # they spin on the kernels' cores
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     try:
         from modeharvest.cli.root import main
     except KeyboardInterrupt:
