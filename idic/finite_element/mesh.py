@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from scipy.signal import savgol_filter
 from skimage import measure
 
 from modeharvest.fem.field import Mesh, with_mid_sides
@@ -247,6 +246,8 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
 
 def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
     """Smooth a closed contour between its corners, and sample it twice an element."""
+    from scipy.signal import savgol_filter  # half of what it takes to load the correlation
+
     length = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     total, count = float(length.sum()), max(16, int(length.sum()))
     at = np.arange(count) * total / count  # one point a pixel

@@ -31,7 +31,7 @@ import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from modeharvest.imaging.speckle.periodic_spline import PeriodicSpline
 from modeharvest.util.arrays import ComplexArray, FloatArray
@@ -107,7 +107,7 @@ class Layer:
         field = self.field
         values = gaussian_field(field.cycles_per_px / field.finer, field.seed, self.samples)
         outside, inside = field.levels
-        return np.where(values > norm.isf(field.coverage), inside, outside)
+        return np.where(values > -ndtri(field.coverage), inside, outside)
 
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
         """(rows, cols) exact values at whole pixels, after a filter such as an aperture's.

@@ -12,10 +12,10 @@ chapter 9). Here rho = exp(-r² / (2 a²)), so every term is a Gaussian, and sta
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi, sqrt
+from math import exp, pi, sqrt
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from modeharvest.imaging.speckle.pattern import BinaryField, SpeckleSpec
 
@@ -52,16 +52,14 @@ class SpeckleStatistics:
 
     @classmethod
     def _of_layer(cls, field: BinaryField, spread: float) -> SpeckleStatistics:
-        (outside, inside), t = field.levels, float(norm.isf(field.coverage))
+        (outside, inside), t = field.levels, -float(ndtri(field.coverage))
         hermite = np.ones(_TERMS)  # He_n(t) / sqrt(n!)
         hermite[1] = t
         for n in range(1, _TERMS - 1):
             hermite[n + 1] = (t * hermite[n] - sqrt(n) * hermite[n - 1]) / sqrt(n + 1)
         order = np.arange(1, _TERMS + 1)
-        weight = ((inside - outside) * norm.pdf(t) * hermite) ** 2 / order
-        before = 1.0 / (
-            order * (2.0 * pi * field.cycles_per_px) ** 2
-        )  # squared widths of the terms
+        weight = ((inside - outside) * exp(-0.5 * t**2) * hermite) ** 2 / (2.0 * pi * order)
+        before = 1.0 / (order * (2.0 * pi * field.cycles_per_px) ** 2)  # squared widths of terms
         after = before + 2.0 * (field.blur_px**2 + spread)
         mean = outside + (inside - outside) * field.coverage
         kept = weight * before / after
