@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.special import ndtri
+from scipy import ndimage, special
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.imaging.grid import PixelGrid
@@ -87,7 +86,7 @@ def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise
     second = np.array([1.0, -2.0, 1.0])
     details = ndimage.convolve(image.astype(np.float64), np.outer(second, second))
     off = details[ndimage.binary_erosion(mask, iterations=2)]
-    sd = np.median(abs(off - np.median(off))) / (6.0 * ndtri(0.75))
+    sd = np.median(abs(off - np.median(off))) / (6.0 * special.ndtri(0.75))
     return CameraNoise(
         float(sd), "estimated from the finest details of the reference: two exposures measure it"
     )
