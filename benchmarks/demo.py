@@ -4,7 +4,8 @@ Runs ``modeharvest run paper-virtual`` twice in processes of its own: with all t
 a new machine (numba's kernels and dolfinx' forms), and with it cached. "other" is what lies between
 the stages: Python's start, and waiting for the kernels that children compile while the finite
 elements run. Seconds are this machine's; the shares of the stages and the peak memory (of the
-largest process) carry over. The line before is what ``modeharvest --help`` takes, the best of five.
+largest process) carry over. The lines before are what ``modeharvest --help`` takes, the
+best of five, and what ``modeharvest demo`` takes: thrice with all to be compiled, and again.
 """
 
 from __future__ import annotations
@@ -40,6 +41,11 @@ def main() -> None:
         environment = {**os.environ, **own}
         best = min(timed("--help", environment=environment)[0] for _ in range(5))
         print(f"modeharvest --help: {best:.2f} s")
+        for k, which in enumerate(("first", "first", "first", "again")):
+            kernels = {"NUMBA_CACHE_DIR": f"{folder}/demo{min(k, 2)}"}
+            out = f"{folder}/modeharvest-demo{k}"
+            seconds, busy = timed("demo", "--out", out, environment=environment | kernels)
+            print(f"modeharvest demo, {which}: {seconds:.1f} s, {busy:.1f} s of processors")
         columns = (*STAGES, "other", "whole", "processors")
         print(f"{'kernels':10}" + "".join(f"{name + ' [s]':>16}" for name in columns), end="")
         print(f"{'peak [MiB]':>16}")
