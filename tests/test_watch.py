@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import threading
 import time
@@ -190,6 +191,10 @@ def test_the_page_holds_all_and_reloads_until_the_end(
     assert "It buckles at" in page
     assert "http-equiv" not in page
     assert "src=" not in page
+    # A curve of a colour that the page doesn't know isn't there.
+    assert {name for name in re.findall(r"var\((--\w+)\)", page) if f"{name}:" not in page} == set()
+    assert "var(--muted)" in page
+    assert "font-size: 10px" not in page  # matplotlib's own style
     from modeharvest.report.figures.sequence import write_watch_page
 
     write_watch_page(tmp_path / "watch.html", "<b>", WatchedTest(test.rows[:1]), None)

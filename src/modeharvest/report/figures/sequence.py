@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from modeharvest.report.figures.curves import curve
-from modeharvest.report.figures.style import BLUE, GREY, MUTED, RED, figure, to_svg
+from modeharvest.report.figures.style import BLUE, GREY, MUTED, RED, figure, style, to_svg
 from modeharvest.report.model import Card
 from modeharvest.runs.photographs.watch import WatchedTest
 from modeharvest.util.arrays import FloatArray, FloatImage
@@ -49,12 +49,13 @@ def write_watch_page(
     """
     last = next(reversed(test.predictions), None)
     figures = {}
-    if photograph is not None:
-        figures["The last photograph"] = draw_photograph(photograph)
-    if test.rows:
-        figures["Amplitude of the pattern"] = draw_amplitude(test, last)
-    if last is not None:
-        figures["Growth: where the line ends, it buckles"] = draw_growth(test, last)
+    with style():
+        if photograph is not None:
+            figures["The last photograph"] = draw_photograph(photograph)
+        if test.rows:
+            figures["Amplitude of the pattern"] = draw_amplitude(test, last)
+        if last is not None:
+            figures["Growth: where the line ends, it buckles"] = draw_growth(test, last)
     content = {
         "title": escape(title or "A test, watched"),
         "refresh": "" if test.conclusion else f'<meta http-equiv="refresh" content="{_RELOAD_S}">',
@@ -141,12 +142,13 @@ def draw_growth(test: WatchedTest, found: Prediction) -> Figure:
 
 _RELOAD_S = 3
 _PAGE = Template("""<!doctype html>
-<html lang="en"><head><meta charset="utf-8">$refresh<title>$title · modeharvest</title>
-<style>
-body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; color: #16191d; }
-main { display: flex; flex-wrap: wrap; gap: 24px; }
-figure { margin: 0; flex: 1 1 360px; max-width: 560px; } figcaption { font-weight: 600; }
-svg { width: 100%; height: auto; } ul { color: #6a7078; font-size: .9rem; }
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+$refresh<title>$title · modeharvest</title><style>
+:root { color-scheme: light dark; --muted: light-dark(#6a7078, #9aa1ab); }
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem; }
+main { columns: 2 360px; column-gap: 24px; } figcaption { font-weight: 600; }
+figure { margin: 0 0 16px; break-inside: avoid; }
+svg { width: 100%; height: auto; } ul { color: var(--muted); font-size: .9rem; }
 </style></head>
 <body><h1>$title</h1><p>$lead</p><main>$figures</main><ul>$skipped</ul></body></html>
 """)
