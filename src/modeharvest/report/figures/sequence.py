@@ -96,8 +96,7 @@ def draw_photograph(image: FloatImage) -> Figure:
     step = max(1, max(image.shape) // 500)
     few = image[::step, ::step]
     drawn = figure(4.2, 4.2 * few.shape[0] / few.shape[1])
-    axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set_axis_off()
+    axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0), frameon=False, xticks=[], yticks=[])
     low, high = np.percentile(few, (0.5, 99.5))
     axes.imshow(few, cmap=GREY, vmin=low, vmax=max(high, low + 1e-9), rasterized=True)
     return drawn
@@ -146,9 +145,8 @@ _PAGE = Template("""<!doctype html>
 $refresh<title>$title · modeharvest</title><style>
 :root { color-scheme: light dark; --muted: light-dark(#6a7078, #9aa1ab); }
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem; }
-main { columns: 2 360px; column-gap: 24px; } figcaption { font-weight: 600; }
-figure { margin: 0 0 16px; break-inside: avoid; }
-svg { width: 100%; height: auto; } ul { color: var(--muted); font-size: .9rem; }
-</style></head>
+main { columns: 2 360px; column-gap: 24px; } ul { color: var(--muted); font-size: .9rem; }
+figure { margin: 0 0 16px; break-inside: avoid; } figcaption { font-weight: 600; }
+svg { width: 100%; height: auto; }</style></head>
 <body><h1>$title</h1><p>$lead</p><main>$figures</main><ul>$skipped</ul></body></html>
 """)
