@@ -15,7 +15,7 @@ OPTIONAL = {
     "fenics-dolfinx": "finite elements: conda, or apt install python3-dolfinx",
     "petsc4py": "the same",
     "slepc4py": "eigenvalues of infinite lattices: conda, or apt install python3-slepc4py",
-    "gmsh": "meshes: pip install gmsh",
+    "gmsh": "meshes: pip install gmsh; beside dolfinx: conda, or apt install python3-gmsh",
     "imageio-ffmpeg": "videos: pip install imageio-ffmpeg",
 }
 """Libraries that only some commands need, and how to get them."""
