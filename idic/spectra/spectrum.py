@@ -71,13 +71,14 @@ class Spectrum:
         return self.cell * self.sum_over(self.source, xi).conj()
 
     def sum_over(self, values: FloatArray, xi: ArrayLike) -> ComplexArray:
-        """(n,) sum over the bins of values (q, p, n) times exp(2πi ξ·x/l)."""
-        angle_x, angle_y = 2 * np.pi / self.pitch * np.asarray(xi, dtype=np.float64)
-        along_x, along_y = np.exp(1j * angle_x * self.x), np.exp(1j * angle_y * self.y)
+        """(..., n) sum over the bins of values (q, p, n) times exp(2πi ξ·x/l), for ξ (..., 2)."""
+        of = np.asarray(xi, dtype=np.float64)
+        x, y = 2 * np.pi / self.pitch * of.reshape(-1, 2).T[..., None]
+        flat, shape = values.reshape(len(values), -1), values.shape[1:]
         # numpy would turn all values into complex ones.
-        up = np.stack([along_y.real, along_y.imag]) @ values.reshape(len(values), -1)
-        found: ComplexArray = along_x @ (up[0] + 1j * up[1]).reshape(values.shape[1:])
-        return found
+        up = np.cos(y * self.y) @ flat + 1j * (np.sin(y * self.y) @ flat)
+        found = np.einsum("kp,kpn->kn", np.exp(1j * x * self.x), up.reshape(-1, *shape))
+        return np.asarray(found.reshape(*of.shape[:-1], -1))
 
     def window(self, xi_max: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(ξ1, ξ2, density), both components of ξ within ± ``xi_max`` [1/l]."""

@@ -186,13 +186,10 @@ def _amplitudes(
     # Products of sines and cosines are those of sums and differences of their wave vectors, and
     # at a wave vector a sum over all bins is two small products of matrices.
     tapered = taper[..., None] * spectrum.source
-    projected = np.array([spectrum.sum_over(tapered, k) for k in xi])
+    projected = spectrum.sum_over(tapered, xi)
     pairs = xi[:, None] - xi[None, :], xi[:, None] + xi[None, :]
     weight = (taper * spectrum.coverage)[..., None]
-    minus, plus = (
-        np.array([spectrum.sum_over(weight, k)[0] for k in of.reshape(-1, 2)]).reshape(len(xi), -1)
-        for of in pairs
-    )
+    minus, plus = (spectrum.sum_over(weight, of)[..., 0] for of in pairs)
     normal = 0.5 * np.block(
         [[(minus - plus).real, (plus + minus).imag], [(plus - minus).imag, (minus + plus).real]]
     )

@@ -39,7 +39,7 @@ from modeharvest.util.errors import InputError
 
 _FEWEST_BLOCKS = 8
 """Fewer blocks than this tell nothing about how their gradients scatter."""
-_ENOUGH_PX, _STEP_PX = 400_000, 0.002
+_ENOUGH_PX, _STEP_PX = 200_000, 0.002
 _SMALL = np.float32(0.05)
 """Noise is made that much smaller, and its effect larger again: the linear part is wanted."""
 _EXAMPLES = 4

@@ -147,7 +147,7 @@ def deflated(levels: NDArray[np.uint16]) -> dict[str, Any]:
     change[:, 1:] -= change[:, :-1].copy()
     signed = change.view(np.int16)
     both = (levels, ((signed << 1) ^ (signed >> 15)).view(np.uint16))
-    texts = [zlib.compress(part.view(np.uint8).reshape(-1, 2).T.tobytes(), 6) for part in both]
+    texts = [zlib.compress(part.view(np.uint8).reshape(-1, 2).T.tobytes(), 4) for part in both]
     predicted = len(texts[1]) < len(texts[0])
     return {"predicted": predicted, "data": base64.b64encode(texts[predicted]).decode()}
 

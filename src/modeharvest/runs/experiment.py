@@ -176,6 +176,7 @@ class Run(StagedRun[Case]):
                 kernels.wait("image", self.progress)
                 self.image()
                 import_module("modeharvest.report.experiment")  # while kernels compile
+                import_module("modeharvest.report.model").page_template()
                 kernels.wait("correlate", self.progress)
                 self.correlate()
             self.measure()
