@@ -173,10 +173,10 @@ class Run(StagedRun[Case]):
             ahead = [stage for stage in stages if stage not in self.timings]
             with precompiling(ahead) as kernels:
                 solution = self.solved()
-                kernels.wait("image", self.progress)
-                self.image()
                 import_module("modeharvest.report.experiment")  # while kernels compile
                 import_module("modeharvest.report.model").page_template()
+                kernels.wait("image", self.progress)
+                self.image()
                 kernels.wait("correlate", self.progress)
                 self.correlate()
             self.measure()
