@@ -100,9 +100,26 @@ def prune(contents: Element, depth: int) -> None:
                 item.remove(part)
 
 
+def leave_titles(app: Sphinx, page: str, *_: Any) -> None:
+    """Hide the contents of other pages while furo makes a sidebar of their titles.
+
+    Sphinx would copy the contents of all pages for every page, and leave them out then.
+    """
+    for name in app.env.metadata.keys() - app.env.toctree_includes.keys() - {page}:
+        app.env.metadata[name]["tocdepth"] = 1
+
+
+def show_contents(app: Sphinx, *_: Any) -> None:
+    """Undo that, before the next page's own contents are made."""
+    for about in app.env.metadata.values():
+        about.pop("tocdepth", None)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Have the pages written before any is read."""
     app.add_domain(IndexedDomain, override=True)
     app.connect("builder-inited", draw)
     app.connect("env-updated", shorten_contents)
+    app.connect("html-page-context", leave_titles, priority=400)  # furo's is 500
+    app.connect("html-page-context", show_contents, priority=600)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -80,15 +80,8 @@ def restore(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: lis
                 return
 
 
-def shorten(_app: Any, _domain: str, kind: str, content: Any) -> None:
-    """A page's contents name what can be called, not all fields: half the site's time is theirs."""
-    for signature in content.parent.children if kind in ("attribute", "property") else ():
-        signature["_toc_name"] = ""
-
-
 def setup(app: Sphinx) -> dict[str, Any]:
     """Before and after napoleon, whose priority is 500."""
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-process-docstring", restore, priority=600)
-    app.connect("object-description-transform", shorten)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
