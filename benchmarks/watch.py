@@ -22,7 +22,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -165,6 +167,80 @@ def least_deviation(columns: FloatArray, imperfection: float, critical: float) -
     return float(np.sqrt(np.linalg.inv(information)[0, 0])) / critical
 
 
+def print_memory(command: str, counts: Iterable[int]) -> None:
+    """Print the peak memory of so many photographs, and the time of each."""
+    for count in counts:
+        with tempfile.TemporaryDirectory() as folder:
+            begin = time.perf_counter()
+            most = peak(command, count, Path(folder))
+            took = (time.perf_counter() - begin) / count
+        print(f"{command}, {count} photographs: {most:.0f} MB, {took:.1f} s each", flush=True)
+
+
+def print_times(strains: Sequence[float], out: Path) -> None:
+    """Print the time that each photograph of a specimen takes."""
+    experiment = Experiment(strains=strains, imperfection=Imperfection(0.01, 0.01, 1))
+    path = photographed(solved(experiment, out / "time.h5"), out / "time", PIXEL_SIZE, 1)
+    measuring = QuickMeasurement(PhotographCase.read(path))
+    print(f"{measuring.reference.image.size / 1e6:.2f} Mpx")
+    for shot in sorted((path.parent / "shots").iterdir()):
+        begin = time.process_time()
+        row = measuring.measure(shot)
+        busy = time.process_time() - begin
+        print(f"{row['name']}: {row['seconds']:.2f} s, {busy:.2f} s of processors, strain "
+              f"{100 * row['strain']:.2f} %", flush=True)  # fmt: skip
+
+
+def measured(experiment: Experiment, seed: int, kept: Path) -> list[dict[str, float]]:
+    """What is measured of an experiment's photographs; a second run has it at once."""
+    if not kept.is_file():
+        solution = solved(experiment, kept.with_suffix(".h5"))
+        rows = watched(photographed(solution, kept.with_suffix(""), PIXEL_SIZE, seed))
+        kept.write_text(json.dumps(rows))
+    return json.loads(kept.read_text())
+
+
+class Checked(NamedTuple):
+    """A prediction made at a share of the critical load, against what happened."""
+
+    share: float
+    error: float
+    """Of the critical load [-]."""
+    holds: bool
+    """Its interval."""
+    is_useful: bool
+    text: str
+
+
+def checked(columns: FloatArray, there: float, shares: FloatArray) -> Iterator[Checked]:
+    """The predictions at the shares asked for, buckling coming at the load ``there``."""
+    predictions = follow_growth(columns)
+    for share in ASKED:
+        at = predictions[int(np.flatnonzero(share + 1e-6 >= shares)[-1])]
+        if at is not None and share <= shares[-1] + 1e-6:
+            least = least_deviation(columns[:, : at.count], at.imperfection, there)
+            text = (f"{share:.0%} {100 * at.critical:.2f} ({at.interval}; sd at least "
+                    f"{100 * least:.1f} % of it)")  # fmt: skip
+            holds = at.low <= there <= at.high
+            yield Checked(share, at.critical / there - 1.0, holds, at.is_useful, text)
+
+
+def print_shares(found: Sequence[Checked], seeds: int) -> None:
+    """Print how good predictions are, by the load they were made at."""
+    for share in sorted({f.share for f in found}):
+        _, off, holds, useful, _ = (
+            np.array(of) for of in zip(*(f for f in found if f.share == share), strict=True)
+        )
+        of_use = off[useful]
+        print(
+            f"at {share:.0%}: of {seeds}, within 3 % {(np.abs(off) < 0.03).sum()}, intervals "
+            f"hold {holds.sum()}; said to be of use {useful.sum()}, of these median "
+            f"{100 * np.median(of_use):+.1f} %, rms {100 * np.sqrt(np.mean(of_use**2)):.1f} %, "
+            f"largest {100 * np.abs(of_use).max():.1f} %, within 3 % "
+            f"{(np.abs(of_use) < 0.03).sum()}, intervals hold {holds[useful].sum()}"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--picture", type=Path)
@@ -177,15 +253,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()) / "watch")
     given = parser.parse_args()
     if given.memory:
-        command, *counts = given.memory
-        for count in map(int, counts):
-            with tempfile.TemporaryDirectory() as folder:
-                begin = time.perf_counter()
-                most = peak(command, count, Path(folder))
-                took = (time.perf_counter() - begin) / count
-                print(
-                    f"{command}, {count} photographs: {most:.0f} MB, {took:.1f} s each", flush=True
-                )
+        print_memory(given.memory[0], map(int, given.memory[1:]))
         return
     given.out.mkdir(exist_ok=True)
     perfect = solved(Experiment(strains=(0.1,)), given.out / "perfect.h5")
@@ -194,61 +262,22 @@ def main() -> None:
     shares = given.step * np.arange(1, round(given.last / given.step) + 1)
     strains = tuple(np.round(critical * shares, 4))
     if given.time:
-        part = Experiment(strains=strains[::4], imperfection=Imperfection(0.01, 0.01, 1))
-        path = photographed(solved(part, given.out / "time.h5"), given.out / "time", PIXEL_SIZE, 1)
-        measuring = QuickMeasurement(PhotographCase.read(path))
-        print(f"{measuring.reference.image.size / 1e6:.2f} Mpx")
-        for shot in sorted((path.parent / "shots").iterdir()):
-            begin = time.process_time()
-            row = measuring.measure(shot)
-            busy = time.process_time() - begin
-            print(f"{row['name']}: {row['seconds']:.2f} s, {busy:.2f} s of processors, strain "
-                  f"{100 * row['strain']:.2f} %", flush=True)  # fmt: skip
+        print_times(strains[::4], given.out)
         return
-    found = []
+    found: list[Checked] = []
     for seed in range(1, given.seeds + 1):
         scatter = Imperfection(given.scatter, given.scatter, seed)
-        name = f"{given.scatter:g}_{given.step:g}_{given.last:g}_{seed}"
-        kept = given.out / f"{name}.json"  # a second run has them at once
-        if not kept.is_file():
-            experiment = Experiment(strains=strains, imperfection=scatter)
-            solution = solved(experiment, given.out / f"{name}.h5")
-            rows = watched(photographed(solution, given.out / name, PIXEL_SIZE, seed))
-            kept.write_text(json.dumps(rows))
-        rows = json.loads(kept.read_text())
+        name = f"{given.scatter:g}_{given.step:g}_{given.last:g}_{seed}.json"
+        rows = measured(Experiment(strains=strains, imperfection=scatter), seed, given.out / name)
         if seed == 1 and given.picture is not None:
             draw(rows[: int((shares < 0.71).sum())], given.picture)
         columns = WatchedTest(rows).columns
-        predictions = follow_growth(columns)
         # What is measured is the strain of the cellular part, without the bulk at its edges.
         there = float(np.polyval(np.polyfit(strains, columns[0], 2), critical))
-        line = [f"seed {seed}: {100 * there:.2f} %;"]
-        for share in (s for s in ASKED if s <= given.last):
-            k = int(np.flatnonzero(share + 1e-6 >= shares)[-1])
-            at = predictions[k]
-            if at is None:
-                line.append(f"{share:.0%} –")
-                continue
-            is_covered = at.low <= there <= at.high
-            found.append((share, at.critical / there, is_covered, at.is_useful))
-            least = least_deviation(columns[:, : at.count], at.imperfection, there)
-            line.append(f"{share:.0%} {100 * at.critical:.2f} ({at.interval}; sd at least "
-                        f"{100 * least:.1f} % of it)")  # fmt: skip
-        print("  ".join(line), flush=True)
-    for share in (s for s in ASKED if s <= given.last):
-        off, holds, useful = (
-            np.array(of) for of in zip(*(f[1:] for f in found if f[0] == share), strict=True)
-        )
-        off -= 1.0
-        of_use = off[useful]
-        rms = np.sqrt(np.mean(of_use**2))
-        print(
-            f"at {share:.0%}: of {given.seeds}, within 3 % {(np.abs(off) < 0.03).sum()}, intervals "
-            f"hold {holds.sum()}; said to be of use {useful.sum()}, of these median "
-            f"{100 * np.median(of_use):+.1f} %, rms {100 * rms:.1f} %, largest "
-            f"{100 * np.abs(of_use).max():.1f} %, within 3 % {(np.abs(of_use) < 0.03).sum()}, "
-            f"intervals hold {holds[useful].sum()}"
-        )
+        own = list(checked(columns, there, shares))
+        found += own
+        print("  ".join([f"seed {seed}: {100 * there:.2f} %;", *(f.text for f in own)]), flush=True)
+    print_shares(found, given.seeds)
 
 
 if __name__ == "__main__":
