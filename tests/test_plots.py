@@ -208,7 +208,9 @@ def test_each_level_of_the_correlation_is_a_curve(data: ExperimentData) -> None:
 
 def test_the_svg_stands_on_its_own(states: list[SnapshotState]) -> None:
     svg = to_svg(draw_hero(states[1]), "hero", 'a "title" & more')
-    assert svg.startswith("<svg viewBox=")
+    head = re.match(r'<svg viewBox="0 0 ([\d.]+) [\d.]+" style="max-width: (\d+)px"', svg)
+    assert head is not None
+    assert float(head[2]) == pytest.approx(float(head[1]) * 150.0 / 72.0, abs=0.5)
     assert svg.endswith("</svg>")
     assert 'aria-label="a &quot;title&quot; &amp; more"' in svg
     ids = re.findall(r'\bid="([^"]+)"', svg)
