@@ -105,6 +105,17 @@ def test_the_gallery_has_a_dozen_pictures_most_without_dolfinx(site: Path) -> No
 
 
 @pytest.mark.dolfinx
+def test_a_page_shows_its_own_contents_and_the_titles_of_all(site: Path) -> None:
+    page = (site / "generated/api/modeharvest.idic.solver.html").read_text("utf-8")
+    before, _, contents = page.partition('class="toc-tree"')
+    assert 'href="#modeharvest.idic.solver.assembly.NormalEquations"' in contents
+    sidebar = before.partition('class="sidebar-tree"')[2].partition("</aside>")[0]
+    for other in ("modeharvest.fem.path.html", "tutorials/photographs.html"):
+        assert f'{other}"' in sidebar
+    assert ".html#" not in sidebar
+
+
+@pytest.mark.dolfinx
 def test_equations_are_markup(site: Path) -> None:
     assert "<math" in (site / "tutorials/virtual_experiment.html").read_text("utf-8")
 
