@@ -173,7 +173,7 @@ def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
     svg = svg.replace(INK, "currentColor").replace(MUTED, "var(--muted)")
     box = re.search(r'viewBox="[^"]*"', svg)
     assert box is not None, "matplotlib's SVG has a viewBox"
-    most = f'style="max-width: {150 * width:.0f}px"'  # letters twice as large are too large
+    most = f'style="max-width: {150 * width:.0f}px"'  # 150 px an inch: more is too large to read
     head = f'<svg {box.group()} {most} role="img" aria-label="{escape(title)}">'
     return head + svg[svg.index(">") + 1 :]
 
