@@ -9,8 +9,9 @@ of jets, numbers with their first two derivatives, by :func:`stress_and_tangent`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -145,7 +146,8 @@ def power_sum_of_stretches(F: Any, m: float) -> Any:
     ufl = functions_of(F)
     J = ufl.det(F)
     s = ((F[0, 0] - F[1, 1]) ** 2 + (F[0, 1] + F[1, 0]) ** 2) / (4.0 * J)
-    return 2.0 * J ** (0.5 * m) * _cosh_m_asinh_sqrt(ufl, s, m)
+    factor = partial(_cosh_m_asinh_sqrt, ufl, m=m)
+    return 2.0 * J ** (0.5 * m) * (s.through(factor) if isinstance(s, Jet) else factor(s))
 
 
 _SERIES_LIMIT = 0.02
@@ -190,25 +192,27 @@ class Jet:
         bent = second * self.slope[:, None] * self.slope
         return Jet(value, first * self.slope, first * self.curvature + bent)
 
+    def through(self, function: Callable[[Jet], Jet]) -> Jet:
+        """A function of this, differentiated by one variable instead of by four."""
+        if not len(self.slope):
+            return function(self)
+        zero = 0.0 * self.value
+        y = function(Jet(self.value, 1.0 + zero[None], zero[None, None]))
+        return self.of(y.value, y.slope[0], y.curvature[0, 0])
+
     def __add__(self, other: Jet | float) -> Jet:
         if isinstance(other, Jet):
-            return Jet(
-                self.value + other.value, self.slope + other.slope, self.curvature + other.curvature
-            )
+            parts = zip(vars(self).values(), vars(other).values(), strict=True)
+            return Jet(*(own + more for own, more in parts))
         return Jet(self.value + other, self.slope, self.curvature)
 
     def __mul__(self, other: Jet | float) -> Jet:
         if not isinstance(other, Jet):
             return Jet(self.value * other, self.slope * other, self.curvature * other)
         mixed = self.slope[:, None] * other.slope
-        return Jet(
-            self.value * other.value,
-            self.value * other.slope + other.value * self.slope,
-            self.value * other.curvature
-            + other.value * self.curvature
-            + mixed
-            + mixed.swapaxes(0, 1),
-        )
+        slope = self.value * other.slope + other.value * self.slope
+        bent = self.value * other.curvature + other.value * self.curvature
+        return Jet(self.value * other.value, slope, bent + mixed + mixed.swapaxes(0, 1))
 
     def __pow__(self, m: float) -> Jet:
         x = self.value
@@ -278,11 +282,8 @@ class JetMatrix:
         like = x if isinstance(x, Jet) else y
         assert isinstance(like, Jet)
         x, y = (part if isinstance(part, Jet) else like * 0.0 + part for part in (x, y))
-        return Jet(
-            np.where(where, x.value, y.value),
-            np.where(where, x.slope, y.slope),
-            np.where(where, x.curvature, y.curvature),
-        )
+        parts = zip(vars(x).values(), vars(y).values(), strict=True)
+        return Jet(*(np.where(where, own, other) for own, other in parts))
 
 
 def stress_and_tangent(material: Any, F: FloatArray) -> tuple[FloatArray, FloatArray]:

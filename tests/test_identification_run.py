@@ -272,7 +272,7 @@ def test_the_frames_of_a_film_bracket_the_critical_strain(tmp_path: Path) -> Non
 @pytest.mark.dolfinx
 def test_images_of_the_other_branch_are_noticed(tmp_path: Path) -> None:
     """The pattern's mirror image is that of the other branch, whatever the case names."""
-    experiment = {"specimen": SMALL, "strains": [0.1], "mesh_size": 0.55}
+    experiment = {"specimen": SMALL, "strains": [0.1], "mesh_size": 0.62}
     twin = BEFORE["twin"] | {"tilt": 0.01}
     other = BEFORE | {"experiment": experiment | {"branches": ["buckled-"]}, "twin": twin}
     true = IdentificationRun(IdentificationCase.model_validate(other), tmp_path)
@@ -286,7 +286,8 @@ def test_images_of_the_other_branch_are_noticed(tmp_path: Path) -> None:
     data = {"reference": "f.tif", "deformed": ["g.tif"], "pixel_size": 0.05,
             "force_sd": 0.002, **readings}  # fmt: skip
     tables = {key: value for key, value in BEFORE.items() if key not in ("twin", "imaging")}
-    case = IdentificationCase.model_validate(tables | {"experiment": experiment, "data": data})
+    tables |= {"experiment": experiment, "finer_mesh_size": 0.55, "data": data}
+    case = IdentificationCase.model_validate(tables)
     case._base = tmp_path
     found = run_identification(case, tmp_path / "found")
     assert "the specimen is on buckled-: on buckled+ the model fits worse" in found["statements"]

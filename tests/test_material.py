@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import grown
 
 BoolArray = NDArray[np.bool_]
 
@@ -124,3 +127,19 @@ def test_bad_images_are_refused() -> None:
         find_material(np.full((100, 100), np.nan))
     with pytest.raises(InputError, match="window of 5 px or more"):
         find_material(image(0.3, 0.01, specimen()), 4)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    shape=st.tuples(st.integers(1, 25), st.integers(1, 25)),
+    share=st.sampled_from([0.0, 0.02, 0.3, 1.0]),
+    px=st.sampled_from([0.0, 0.7, 1.0, 2.0**0.5, 2.0, 5.0**0.5, 4.3, 30.0]),
+    seed=st.integers(0, 2**16),
+)
+def test_masks_grow_by_a_distance(
+    shape: tuple[int, int], share: float, px: float, seed: int
+) -> None:
+    mask = np.random.default_rng(seed).random(shape) < share
+    near = distance_transform_edt(~mask) <= px if mask.any() else mask
+    np.testing.assert_array_equal(grown(mask, px), near)
+    np.testing.assert_array_equal(grown(mask.T, px), near.T)

@@ -270,13 +270,13 @@ def nodal_values(mesh: Mesh, nodal: FloatArray, at: FloatArray, beside: bool = F
 
 def _local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
     """(k, 2) of points (k, 2) [mm] in elements (k,) that they are beside."""
-    x = mesh.nodes[mesh.cells[element]]
     xi: FloatArray = np.full((element.size, 2), 1.0 / 3.0)
+    left = np.arange(element.size)  # most are there after two steps, few at curved sides are not
     for _ in range(8):
-        off = np.einsum("ka,kai->ki", shape_functions(mesh.element, xi), x) - points
-        F = np.einsum("kai,kaj->kij", x, shape_gradients(mesh.element, xi))
+        x, at = mesh.nodes[mesh.cells[element[left]]], xi[left]
+        off = np.einsum("ka,kai->ki", shape_functions(mesh.element, at), x) - points[left]
+        F = np.einsum("kai,kaj->kij", x, shape_gradients(mesh.element, at))
         step = np.linalg.solve(F, off[..., None])[..., 0]
-        xi = np.clip(xi - step, -1.0, 2.0)
-        if abs(step).max(initial=0.0) < 1e-7:  # Newton's next one would be of its square
-            break
+        xi[left] = np.clip(at - step, -1.0, 2.0)
+        left = left[np.abs(step).max(axis=1) >= 1e-7]  # Newton's next one would be of its square
     return xi

@@ -96,8 +96,7 @@ def shape_functions(name: str, xi: ArrayLike) -> FloatArray:
 
 def shape_gradients(name: str, xi: ArrayLike) -> FloatArray:
     """(..., k, 2) derivatives of the shape functions along xi and eta at (..., 2)."""
-    coefficients = reference_element(name).coefficients
-    return np.asarray(np.einsum("...mi,mk->...ki", monomial_gradients(xi), coefficients))
+    return np.asarray(reference_element(name).coefficients.T @ monomial_gradients(xi))
 
 
 def polynomials(name: str, cells: IntArray, nodal: FloatArray) -> FloatArray:
