@@ -39,7 +39,10 @@ RUN_ELSEWHERE = {
     "photographs": "test_photographs_page",
 }  # fmt: skip
 """Pages whose Python is run by tests that also look at what it finds."""
-COARSER = {"homogenization": ("size=0.2", "size=0.5")}
+COARSER = {
+    "homogenization": ("size=0.2", "size=0.5"),
+    "independence": ("overlays=()", "overlays=(), divisions=8"),
+}
 """What is replaced in a page's Python for it to take seconds."""
 
 
@@ -65,7 +68,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     """Files and names that pages begin with: an image pair, its result, a field of another code."""
     folder = tmp_path_factory.mktemp("given")
     solution = mh.Solution.read(shipped_solution("paper-virtual") or "")
-    spec = mh.ImagingSpec(pixel_size=0.04)
+    spec = mh.ImagingSpec(pixel_size=0.05)
     images = mh.make_images(solution, spec, folder / "images", [0.128])
     pair = images.pair(0.128)
     write_image(folder / "reference.tif", quantise(pair.reference, 8))
@@ -85,6 +88,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 
 
 @pytest.mark.dolfinx
+@pytest.mark.usefixtures("unrendered_pictures")
 @pytest.mark.parametrize("page", RUN_HERE, ids=names(RUN_HERE))
 def test_the_python_of_a_page_runs_from_top_to_bottom(
     page: Path, given: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -24,7 +24,7 @@ COMMANDS = ("run", "harvest", "measure", "identify", "homogenize", "modes", "des
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What a run leaves."""
     folder = tmp_path_factory.mktemp("run")
-    case = Case(experiment=Experiment(), imaging=ImagingSpec(pixel_size=0.04))
+    case = Case(experiment=Experiment(), imaging=ImagingSpec(pixel_size=0.05))
     Run(case, folder, solution=shipped_solution("paper-virtual")).all()
     return dict(read_json(folder / "summary.json"))
 

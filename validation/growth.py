@@ -25,7 +25,7 @@ FEWEST = 5
 """Images that a prediction needs."""
 NEAR = 0.9
 """Of the critical load: beyond, the amplitude is no longer small."""
-OF_METHOD = 0.015
+OF_METHOD = 0.01
 """Standard deviation of a prediction without noise, of the critical load: see
 docs/how-to/sequences.md."""
 _QUANTILES = (0.025, 0.5, 0.975)
