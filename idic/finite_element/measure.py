@@ -83,7 +83,7 @@ class _Stage:
     """Binning and blur of the images."""
     cutoff_px: float
     """Wavelength of which the regularisation leaves one half [px]."""
-    tolerance_px: float = 0.1
+    tolerance_px: float = 0.2
     """Of the step that ends it, rms over the nodes, a tenth of the longest [px]."""
 
 
@@ -298,6 +298,7 @@ class _Measurement:
             self.u = at.u + step * np.repeat(share, 2)
             rms, longest = float(np.sqrt(np.mean(length**2))), float(length.max())
             is_short = rms <= min(_SHORT_PX, 0.5 * last) and longest <= _SHORT_AT_A_NODE_PX
+            is_short = is_short or stage.level != FULL
             if isinstance(self.prior, Imbalance) or not is_short:
                 self.kept = None
             if max(last := rms, 0.1 * longest) < stage.tolerance_px:
