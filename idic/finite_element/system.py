@@ -71,33 +71,32 @@ class NodalPattern:
 
     def assembled(self, nodes: IntArray, blocks: FloatArray) -> csr_array:
         """(2 n, 2 n) sums over nodes (m, k) of blocks xx, xy, yy, or with yx, (m, 3 or 4, k, k)."""
-        parts = np.zeros((blocks.shape[1], self.indices.size))
-        _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), parts)
-        return self.matrix(parts)
-
-    def matrix(self, parts: FloatArray) -> csr_array:
-        """(2 n, 2 n) of nodal parts xx, xy, yy (3, q), or xx, xy, yx, yy (4, q)."""
-        indptr, indices, order = self._of_components
-        data = np.stack([*parts[:2], *parts[-2:]], axis=1).ravel()[order]
+        indptr, indices = self._of_components
+        data = np.zeros(indices.size)
+        _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), data)
         return csr_array((data, indices, indptr), shape=(indptr.size - 1,) * 2)
 
     @cached_property
-    def _of_components(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Row pointers, columns, and the order of entries by nodes there."""
-        numbers = np.arange(4 * self.indices.size).reshape(-1, 2, 2)
-        whole = bsr_array((numbers, self.indices, self.indptr)).tocsr()
-        return whole.indptr, whole.indices, whole.data
+    def _of_components(self) -> tuple[IntArray, IntArray]:
+        """Row pointers and columns."""
+        ones = np.ones((self.indices.size, 2, 2), np.int8)
+        whole = bsr_array((ones, self.indices, self.indptr)).tocsr()
+        return whole.indptr, whole.indices
 
 
 @compiled()
 def _scatter(indptr: Any, indices: Any, nodes: Any, blocks: Any, data: Any) -> None:
+    parts = blocks.shape[1]
     for e in range(nodes.shape[0]):
         for a in range(nodes.shape[1]):
             low, high = indptr[nodes[e, a]], indptr[nodes[e, a] + 1]
             for b in range(nodes.shape[1]):
-                q = low + np.searchsorted(indices[low:high], nodes[e, b])
-                for k in range(data.shape[0]):
-                    data[k, q] += blocks[e, k, a, b]
+                x = 4 * low + 2 * np.searchsorted(indices[low:high], nodes[e, b])
+                y = x + 2 * (high - low)
+                data[x] += blocks[e, 0, a, b]
+                data[x + 1] += blocks[e, 1, a, b]
+                data[y] += blocks[e, parts - 2, a, b]
+                data[y + 1] += blocks[e, parts - 1, a, b]
 
 
 def interior_sides(cells: IntArray) -> IntArray:
@@ -221,9 +220,9 @@ class Body:
 
     def smoothed(self, u: FloatArray, cutoff: float, known: BoolArray | bool = True) -> FloatArray:
         """(n, 2) u less waves shorter than a cut-off [mm], from nodes (n,) where it is known."""
-        node = np.repeat(np.arange(len(u)), np.diff(self.pattern.indptr))
-        own = (self.pattern.indices == node) & np.broadcast_to(known, len(u))[node]
-        one, R = self.pattern.matrix(own * np.array([[1.0], [0.0], [1.0]])), self.smoothness
+        own = np.broadcast_to(known, len(u))[:, None] * np.array([1.0, 0.0, 1.0])
+        one = self.pattern.assembled(np.arange(len(u))[:, None], own[..., None, None])
+        R = self.smoothness
         if not R.data.any():  # a single element
             return u
         weight = (cutoff / self.wavelength) ** Smoothness.power * self.energies(one)
