@@ -29,6 +29,7 @@ from modeharvest.imaging.spline import SplineImage, border_reach, sample_points
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.compiled import compiled, in_parallel, readable
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import grown
 
 _BLOCK = 64
 """Pixels of an element that are worked on together."""
@@ -120,8 +121,7 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     """
     row, col = ndimage.distance_transform_edt(~mask, None, False, True)
     filled = np.ascontiguousarray(image[row, col])
-    square = (row - np.arange(len(row))[:, None]) ** 2 + (col - np.arange(row.shape[1])) ** 2
-    rows, cols = np.nonzero((square > 0) & (square <= _REACH_PX**2))
+    rows, cols = np.nonzero(grown(mask, _REACH_PX) & ~mask)
     in_parallel(_continue, *map(readable, (image, mask, rows, cols)), filled)
     return filled
 
