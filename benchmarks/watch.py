@@ -50,7 +50,7 @@ LAST = 0.95
 """Of a specimen's own critical strain, up to which photographs are taken."""
 PIXEL_SIZE = 0.0107
 """Of 3.14 Mpx [mm]."""
-ASKED = (0.5, 0.6, 0.7, 0.8)
+ASKED = (0.5, 0.6, 0.7, 0.8, 0.9)
 
 
 def solved(experiment: Experiment, path: Path) -> Solution:
