@@ -62,7 +62,7 @@ _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
 _SHORT_PX, _SHORT_AT_A_NODE_PX = 0.1, 0.5
 """After shorter steps the matrices are kept, where only the images make them change and steps get
-shorter; rms over the nodes, and of a single one [px]."""
+shorter; rms over the nodes, and of a single one [px]. On coarse levels after longer ones, too."""
 _LEAST_DET = 0.1
 """Elements that shrink to less are an iteration gone astray."""
 _UNLIKE, _SEEN = 0.25, 0.25
@@ -297,8 +297,9 @@ class _Measurement:
             share = np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
             rms, longest = float(np.sqrt(np.mean(length**2))), float(length.max())
-            is_short = rms <= min(_SHORT_PX, 0.5 * last) and longest <= _SHORT_AT_A_NODE_PX
-            is_short = is_short or stage.level != FULL
+            coarse = stage.level != FULL
+            short = (np.inf, _LONGEST_STEP_PX) if coarse else (_SHORT_PX, _SHORT_AT_A_NODE_PX)
+            is_short = rms <= min(short[0], 0.5 * last) and longest <= short[1]
             if isinstance(self.prior, Imbalance) or not is_short:
                 self.kept = None
             if max(last := rms, 0.1 * longest) < stage.tolerance_px:
