@@ -282,15 +282,17 @@ def main() -> None:
         return
     given.out.mkdir(exist_ok=True)
     shares = given.step * np.arange(1, round(given.last / given.step) + 1)
+    perfect = critical_strain(Experiment())
+    print(f"critical strain of the perfect specimen {100 * perfect:.3f} % nominal")
     if given.time:
-        print_times(tuple(np.round(0.096 * shares, 4))[::4], given.out)
+        print_times(tuple(np.round(perfect * shares, 4))[::4], given.out)
         return
     found: list[Checked] = []
     for seed in range(1, given.seeds + 1):
         experiment = Experiment(imperfection=Imperfection(given.scatter, given.scatter, seed))
         critical = critical_strain(experiment)
         strains = tuple(np.round(critical * shares, 4))
-        name = f"{given.scatter:g}_{given.step:g}_{given.last:g}_{seed}.json"
+        name = f"{given.scatter:g}_{given.step:g}_{given.last:g}_{seed}_{critical:.5f}.json"
         rows = measured(replace(experiment, strains=strains), seed, given.out / name)
         if seed == 1 and given.picture is not None:
             draw(rows[: int((shares < 0.71).sum())], given.picture)
