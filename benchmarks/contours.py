@@ -98,6 +98,11 @@ def negative(image: FloatImage) -> FloatImage:
     return np.float32(0.85) - image
 
 
+def thresholded(image: FloatImage) -> FloatImage:
+    """Two grey levels."""
+    return np.where(image > 0.43, np.float32(0.7), np.float32(0.15))
+
+
 def weaker(image: FloatImage) -> FloatImage:
     """Less contrast."""
     return np.float32(0.8) * image + np.float32(0.05)
@@ -114,6 +119,9 @@ ROWS = (
     Row("two-term I1 law", law=TwoTermI1()),
     Row("cut across", cols=(0.0, 0.6)), Row("cut along", rows=(0.0, 0.5)),
     Row("middle", rows=(0.2, 0.8), cols=(0.2, 0.8)),
+    Row("two grey levels", 0.0, reference=thresholded, deformed=thresholded),
+    Row("middle, two grey levels", 0.0, reference=thresholded, deformed=thresholded,
+        rows=(0.2, 0.8), cols=(0.2, 0.8)),
     Row("dots", dots=0.36), Row("dots before buckling", strain=0.078, dots=0.36),
 )  # fmt: skip
 

@@ -58,14 +58,9 @@ _FINEST_PX = 4.0
 
 
 def correlate(
-    pair: ImagePair,
-    ansatz: Ansatz,
-    *,
-    strain: float | None = None,
-    guess: ArrayLike | None = None,
-    options: CorrelationOptions | None = None,
-    progress: Progress = silent,
-) -> Result:
+    pair: ImagePair, ansatz: Ansatz, *, strain: float | None = None, guess: ArrayLike | None = None,
+    options: CorrelationOptions | None = None, progress: Progress = silent,
+) -> Result:  # fmt: skip
     """Find the unknowns that make the deformed image match the reference.
 
     Minimises 1/2 sum (f(x) - g(x + u(x, a)))^2 over the pixels of the reference that show material:

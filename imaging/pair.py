@@ -141,6 +141,8 @@ class ImagePair:
     """What a measurement should find, where that is known."""
     strain: float = math.nan
     """Nominal strain of the deformed image [-]; NaN where it isn't known."""
+    is_plain: bool = False
+    """Whether only the material's contours count: it may have one grey level."""
 
     def __post_init__(self) -> None:
         for name in ("reference", "deformed"):
@@ -148,7 +150,8 @@ class ImagePair:
         for name in ("mask", "deformed_mask"):
             mask = checked_mask(getattr(self, name), name.replace("_", " "), self.grid)
             object.__setattr__(self, name, mask)
-        for grey, what in zip(self.grey, ("reference", "deformed"), strict=True):
+        shown = (self.reference, self.deformed) if self.is_plain else self.grey
+        for grey, what in zip(shown, ("reference", "deformed"), strict=True):
             require_visible(grey, f"in the {what} image")
 
     @property

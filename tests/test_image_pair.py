@@ -56,6 +56,14 @@ def test_what_cannot_be_correlated_is_refused(
         ImagePair(grid=GRID, **(whole | change))
 
 
+def test_a_plain_material_may_have_one_grey_level() -> None:
+    thresholded = np.where(LEFT, 7, 0)
+    pair = ImagePair(thresholded, thresholded, GRID, LEFT, is_plain=True)
+    np.testing.assert_array_equal(pair.reference, thresholded)
+    with pytest.raises(InputError, match="contrast in the deformed image"):
+        ImagePair(thresholded, 0 * F, GRID, LEFT, is_plain=True)
+
+
 def test_rms_is_per_component_and_of_the_material_alone() -> None:
     u = np.where(LEFT[..., None], [0.3, -0.1], np.nan)
     pair = ImagePair(F, F[::-1], GRID, LEFT, truth=Truth.of(displacement=u))

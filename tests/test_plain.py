@@ -18,6 +18,7 @@ from modeharvest.fem.materials import stress_and_tangent
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.contours import (
     ELASTOMER,
+    STEPS_PX3,
     displacement_from_contours,
     straight_sides,
 )
@@ -263,6 +264,55 @@ def test_a_buckled_specimen_without_speckle(photographed: Path) -> None:
     # Holes are flattened along x and y in turn, as the pattern has it.
     flat = [abs(HoleShape.of(hole).orientation_deg) for _, hole in matched.holes]
     assert 25 <= np.sum(np.array(flat) < 30.0) <= 35
+
+
+def test_a_thresholded_disk_is_as_uncertain_as_is_assumed() -> None:
+    # The area of pixels whose centres are in a disk, over its circumference: how far its edge is
+    # off on average, whose variance falls with the circumference.
+    rng, y, x = np.random.default_rng(0), *np.mgrid[-40:41, -40:41]
+    for radius in (12.3, 30.7):
+        r = radius + rng.random(1000)
+        seen = [
+            np.sum(np.hypot(x - a, y - b) < c)
+            for c, (a, b) in zip(r, rng.random((1000, 2)), strict=True)
+        ]
+        noise = np.mean((np.array(seen) - np.pi * r**2) ** 2 / (2.0 * np.pi * r))
+        assert noise == pytest.approx(0.5 * STEPS_PX3, rel=0.15)
+
+
+def test_thresholded_pictures_are_measured_with_wider_intervals(photographed: Path) -> None:
+    (pair,) = make_images(Solution.read(SHIPPED), PLAIN, photographed, (0.128,))
+    names = "reference", "deformed_1280"
+    grey = [read_image(photographed / f"{name}_8bit.tif") for name in names]
+    f, g = (np.where(image > 0.43, 200, 20).astype(np.float32) for image in grey)
+    surface = plain_surface(f)
+    assert surface is not None
+    body = FiniteElementOptions().body(surface.mask, pair.grid)
+    result, matched = displacement_of_plain(surface, g, pair.grid, body)
+    assert len(matched.holes) == 60
+    (text,) = result.warnings
+    assert text.startswith("Contours are met within 0.")
+    assert "thresholded pictures" in text
+    found = result.displacement_on()
+    off = np.abs(found - pair.truth.displacement)
+    there = surface.mask & np.isfinite(off).all(axis=-1)
+    off = off[there]
+    assert np.sqrt(np.mean(off**2)) < 0.4 * pair.grid.pixel_size
+    assert 0.85 < np.mean(off < 1.96 * result.standard_deviation_on()[there]) <= 1.0
+
+
+def test_a_plate_that_fills_the_picture_is_not_taken_for_its_holes() -> None:
+    centres = np.stack(np.meshgrid([25.3, 60.1, 95.4], [24.8, 60.4, 95.2]), axis=-1).reshape(-1, 2)
+    image = disks((120, 120), -4.0, centres, np.array([13.0, 10.0]), 0.3)
+    for picture in (image, 0.8 - image):
+        surface = plain_surface(picture)
+        assert surface is not None
+        assert surface.is_part
+        assert len(surface.contours) == len(centres)
+        assert surface.mask[[0, -1]].all()
+    few = plain_surface(disks((120, 120), -4.0, centres[:2], np.array([13.0, 10.0]), 0.3))
+    assert few is not None  # few islands are specimens
+    assert not few.mask[0].any()
 
 
 def cropped(photographed: Path, part: str) -> tuple[FloatImage, FloatImage, FloatArray]:

@@ -79,6 +79,16 @@ _ASTRAY = (
     "The displacement from contours didn't converge: don't use it; give pictures in between, or of "
     "more pixels across notches and slits."
 )
+_UNEXPLAINED_PX = 0.05
+"""Distance from contours beyond their noise, rms, that a picture of grey levels doesn't have."""
+_STEP_PX, STEPS_PX3 = 1.0 / np.sqrt(6.0), 0.6765**2 / np.pi
+"""Two thresholded pictures: standard deviation of where a straight edge is, rectangular in each;
+and variance of a hole's edge times length [px^3], whose area is known to 0.6765 sqrt(radius) in
+each: M. G. Kendall, Q. J. Math. 19 (1948) 1."""
+_STEPPED = (
+    "Contours are met within {:.2f} px, of which noise explains {:.2f} px: thresholded pictures, "
+    "or a body far from the assumed law. Standard deviations are those of thresholded pictures."
+)
 _TRIANGULAR, _RECTANGULAR = 6.0, 3.0
 """Half-width squared over variance of such distributions: of what is most likely in the middle, and
 of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
@@ -149,6 +159,10 @@ class _Edge:
             square = np.average((other[at] ** 2).sum(axis=1), axis=0, weights=share)
             other[at] /= np.sqrt(np.maximum(square, _TINY))  # of size 1, as the forces
         return own, other
+
+    def on(self, side: IntArray) -> BoolArray:
+        """(q,) which points are on a side of nodes (k,)."""
+        return np.isin(self.shapes.indices.reshape(-1, 3)[:, 1], side)
 
     def look(self, u: FloatArray) -> None:
         """See which points have left the image at displacements (n, 2).
@@ -367,12 +381,11 @@ class _PenalisedBody:
         """The straight edges that something presses or pulls."""
         d, normal = (part[: len(self.edge.points)] for part in self.distances())
         seen = self.edge.points + self.edge.shapes @ self.u.reshape(-1, 2) - d[:, None] * normal
-        first = self.edge.shapes.indices.reshape(-1, 3)[:, 1]
         sides, tractions = [], []
         for nodes in straight_sides(self.mesh):
-            own = np.isin(first, nodes) & self.edge.is_tied
-            tied = 2 * own.sum() > np.isin(first, nodes).sum()
-            if tied and _bend(seen[own]) < _STAYS_STRAIGHT:
+            on = self.edge.on(nodes)
+            own = on & self.edge.is_tied
+            if 2 * own.sum() > on.sum() and _bend(seen[own]) < _STAYS_STRAIGHT:
                 sides.append(nodes)
                 tractions.append(abs(np.average(d[own], weights=self.edge.whole_length[own])))
         most = max(tractions, default=0.0)
@@ -380,8 +393,7 @@ class _PenalisedBody:
 
     def press(self, sides: Sequence[IntArray], *, slides: bool) -> None:
         """Let plates press straight edges, which keep their length unless they slide."""
-        first = self.edge.shapes.indices.reshape(-1, 3)[:, 1]
-        self.pressed = [np.isin(first, nodes) & self.edge.is_tied for nodes in sides]
+        self.pressed = [self.edge.on(nodes) & self.edge.is_tied for nodes in sides]
         if slides or not sides:
             return
         ends = np.vstack([np.stack([nodes[:-1], nodes[1:]], axis=1) for nodes in sides])
@@ -441,15 +453,9 @@ class _PenalisedBody:
 
 
 def displacement_from_contours(
-    seen: SeenContours,
-    body: Body,
-    grid: PixelGrid,
-    start: FloatArray,
-    law: Material | None = None,
-    *,
-    slides: bool = False,
-    progress: Progress = silent,
-) -> NodalResult:
+    seen: SeenContours, body: Body, grid: PixelGrid, start: FloatArray, law: Material | None = None,
+    *, slides: bool = False, progress: Progress = silent,
+) -> NodalResult:  # fmt: skip
     """Find the displacement of a body from the contours of its edges.
 
     InputError if no contour is at the mesh's edge, or they don't hold the body.
@@ -480,10 +486,15 @@ def displacement_from_contours(
         step(3)
         u, mesh = state.u.reshape(-1, 2), body.mesh
         left = np.asarray(state.u - before).reshape(-1, 2) * (soft / (stiff - soft))
-        sd, known = _deviations(state, seen.noise, law is None, bool(sides) and not slides, left)
+        d, _ = state.distances()
+        rms = float(np.sqrt(np.average(d**2, weights=state.edge.length))) / state.px
+        by_noise = float(np.sqrt(seen.noise / seen.correlated)) / state.px
+        if is_stepped := rms**2 > by_noise**2 + _UNEXPLAINED_PX**2:
+            state.noise = max(seen.noise, STEPS_PX3 * state.px**3)
+        sd, known = _deviations(state, law is None, bool(sides) and not slides, is_stepped, left)
     except ArithmeticError as error:
         raise InputError(f"expected contours that hold the body, got others: {_ASTRAY}") from error
-    d, _ = state.distances()
+    stepped = (_STEPPED.format(rms, by_noise),) if is_stepped else ()
     return NodalResult(
         mesh=mesh,
         displacement=u,
@@ -495,38 +506,37 @@ def displacement_from_contours(
         grid=grid,
         cutoff_px=None,
         tried=(),
-        residual_rms=float(np.sqrt(np.average(d**2, weights=state.edge.length))) / grid.pixel_size,
-        residual_noise=float(np.sqrt(seen.noise / seen.correlated)) / grid.pixel_size,
+        residual_rms=rms,
+        residual_noise=by_noise,
         pixels=int(state.edge.length.sum() / grid.pixel_size),
         outside=int((state.edge.length == 0.0).sum()),
         effective_unknowns=known,
         library="" if state._factor is None else state._factor.library,
         shown="contours",
-        warnings=() if converged else (_ASTRAY,),
+        warnings=stepped if converged else (_ASTRAY, *stepped),
     )
 
 
 def _deviations(
-    state: _PenalisedBody, noise: float, law_is_assumed: bool, may_slide: bool, left: FloatArray
+    state: _PenalisedBody, law_is_assumed: bool, may_slide: bool, is_stepped: bool, left: FloatArray
 ) -> tuple[Deviations, float]:
     """Standard deviations by noise, law, plates, springs; how many unknowns contours determine."""
     mesh, edge, rng = state.mesh, state.edge, np.random.default_rng(0)
     A, springs, _ = state.linearised()
     _, normal = state.distances()
-    weighed = diags_array(state.stiffness * np.sqrt(edge.length * noise)) @ edge.normal_shapes(
-        normal
-    )
+    pulls = edge.normal_shapes(normal).T @ diags_array(state.stiffness * edge.length)
     drawn = rng.standard_normal((len(normal), SAMPLES))
+    off = np.sqrt(state.noise / np.maximum(edge.length, _TINY))[:, None] * drawn
+    for side in straight_sides(mesh) if is_stepped else ():
+        steps = _STEP_PX * state.px * rng.choice([-1.0, 1.0], SAMPLES)
+        off[: len(edge.points)] += np.outer(edge.on(side), steps)
     z, factor = rng.choice([-1.0, 1.0], (state.u.size, _PROBES)), state.factor(A)
-    found = factor.solve(np.column_stack([weighed.T @ drawn, springs @ z]))
-    off = np.sqrt(noise / np.maximum(edge.length, _TINY))[:, None] * drawn
-    found[:, :SAMPLES] = state.with_tractions(found[:, :SAMPLES], factor, off)
-    known = float(np.sum(z * found[:, SAMPLES:])) / _PROBES
-    samples = found[:, :SAMPLES].reshape(-1, 2, SAMPLES)
-    spread = gradient_covariance(mesh, samples)
-    error = interpolation_error(mesh, state.u.reshape(-1, 2))
-    none = samples[..., :0]
-    sd = Deviations(samples, none, none, error, spread).with_bias(mesh, left)
+    known = float(np.sum(z * factor.solve(springs @ z))) / _PROBES
+    found = state.with_tractions(factor.solve(pulls @ off), factor, off)
+    samples = found.reshape(-1, 2, SAMPLES)
+    error, none = interpolation_error(mesh, state.u.reshape(-1, 2)), samples[..., :0]
+    sd = Deviations(samples, none, none, error, gradient_covariance(mesh, samples))
+    sd = sd.with_bias(mesh, left)
     changes = []
     if state.tractions.size:
         others = state.by_other_tractions(factor, SOME)

@@ -118,14 +118,10 @@ class MeasuredPhotograph:
 
 
 def measure(
-    pair: ImagePair,
-    geometry: Geometry,
-    cell_size: float,
-    how: PhotographOptions,
-    local: LocalField | None = None,
-    before: MeasuredPhotograph | None = None,
+    pair: ImagePair, geometry: Geometry, cell_size: float, how: PhotographOptions,
+    local: LocalField | None = None, before: MeasuredPhotograph | None = None,
     progress: Progress = silent,
-) -> MeasuredPhotograph:
+) -> MeasuredPhotograph:  # fmt: skip
     """Find ansatz and initial guess, and correlate.
 
     InputError if the two images don't show the same surface, or the spectrum contradicts the cell

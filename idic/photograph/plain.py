@@ -42,6 +42,8 @@ from modeharvest.util.typed import picked
 _BLUR_PX = 0.7
 _CORRELATED_PX = 2.0 * np.sqrt(np.pi) * _BLUR_PX
 """Length over which that correlates white noise."""
+_LENS_PX = 1.0
+"""Width of a lens that a picture of two grey levels exactly didn't have."""
 _TWO_LEVELS = 0.9
 """Share of a picture's variance that two grey levels explain: 0.98 of plain pictures with noise of
 1 %, 0.67 to 0.81 of speckled ones with a background."""
@@ -69,6 +71,8 @@ _DOT, _DOT_GROWS = 1.0 / 6.0, 1.8
 the reference's largest dot in another picture, where holes may be nearly closed."""
 _CLEAR = 0.02
 """Share of the picture's border that dirt may be taken for."""
+_ONE_OF_MANY = 0.2
+"""Area of the largest hole over all holes', at most, where the border is all material."""
 _SHORTEST_CUT = 24
 """Points of a contour that ends at the picture's border, at least: corners of others are no use."""
 _SECOND = 0.2
@@ -139,7 +143,10 @@ def plain_surface(
     the picture's border is in view in part: its contours end there. Contours within the material of
     an area [px^2] below ``dot_px2``, by default a sixth of the largest hole's, are dots on it.
     """
-    grey = gaussian_filter(np.asarray(image, dtype=np.float32), _BLUR_PX)
+    image = np.asarray(image, dtype=np.float32)
+    if ((image == image.min()) | (image == image.max())).all():  # thresholded: soften the steps
+        image = gaussian_filter(image, _LENS_PX)
+    grey = gaussian_filter(image, _BLUR_PX)
     few = max(1, min(grey.shape) // _COARSE_PX)
     found = None if _two_levels(grey[::few, ::few]) is None else _two_levels(grey)
     if found is None:
@@ -211,13 +218,15 @@ def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | 
 def _is_material(bright: BoolArray) -> bool:
     """Whether the material is bright: what isn't at the picture's border.
 
-    Where both are there, it is what is in fewer parts, because holes are many.
+    Where both are there, it is what is in fewer parts, because holes are many; what is around many
+    that are alike is material, too.
     """
     border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]]).mean()
-    parts = [label(large_parts(side, _LEAST_PX2))[1] for side in (bright, ~bright)]
-    if _CLEAR < border < 1.0 - _CLEAR and parts[0] != parts[1]:
-        return bool(parts[0] < parts[1])
-    return bool(border < 0.5)
+    sizes = [np.bincount(label(large_parts(s, _LEAST_PX2))[0][s])[1:] for s in (bright, ~bright)]
+    within = sizes[int(border >= 0.5)]
+    if _CLEAR < border < 1.0 - _CLEAR and len(sizes[0]) != len(sizes[1]):
+        return len(sizes[0]) < len(sizes[1])
+    return bool((border < 0.5) != (within.max(initial=0) < _ONE_OF_MANY * within.sum()))
 
 
 def contours_around(
@@ -452,14 +461,9 @@ def _laid_over(a: FloatArray, b: FloatArray, reach: float) -> FloatArray:
 
 
 def displacement_of_plain(
-    reference: MaterialContours,
-    image: FloatImage,
-    grid: PixelGrid,
-    body: Body,
-    progress: Progress = silent,
-    name: str = "the picture",
-    before: FloatArray | None = None,
-) -> tuple[NodalResult, MatchedContours]:
+    reference: MaterialContours, image: FloatImage, grid: PixelGrid, body: Body,
+    progress: Progress = silent, name: str = "the picture", before: FloatArray | None = None,
+) -> tuple[NodalResult, MatchedContours]:  # fmt: skip
     """The displacement in another picture (rows, cols) of a plain specimen, and its contours.
 
     For the rest see :func:`displacement_between`. InputError, in which the picture has a name, if

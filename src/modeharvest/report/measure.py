@@ -40,12 +40,9 @@ _SHOWN = 4
 
 
 def measure_report(
-    summary: Summary,
-    results: Mapping[str, NodalResult] | None = None,
-    residual: Residual | None = None,
-    picture: Picture | None = None,
-    gauges: Sequence[Gauge] = (),
-) -> Report:
+    summary: Summary, results: Mapping[str, NodalResult] | None = None,
+    residual: Residual | None = None, picture: Picture | None = None, gauges: Sequence[Gauge] = (),
+) -> Report:  # fmt: skip
     """The report of a measurement.
 
     ``summary``: the content of ``summary.json``. ``results`` by the images' names, and what gives
@@ -100,13 +97,9 @@ def measure_report(
 
 
 def _cards(
-    k: int,
-    name: str,
-    results: Mapping[str, NodalResult],
-    residual: Residual,
-    picture: Picture,
+    k: int, name: str, results: Mapping[str, NodalResult], residual: Residual, picture: Picture,
     unit: str,
-) -> list[Card]:
+) -> list[Card]:  # fmt: skip
     """Maps of one image."""
     result = results[name]
     frame = MapFrame.of(MeshBoundary.of(result.mesh), result.grid)

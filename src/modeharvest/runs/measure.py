@@ -246,7 +246,8 @@ class MeasureRun(StagedRun[MeasureCase]):
     def pair(self, name: str) -> ImagePair:
         """The reference, a deformed image, and the mask."""
         frame = read_frame(self.case.files[name], self.reference)
-        return ImagePair(self.reference.image, frame.image, self.grid, self.material.mask)
+        images, is_plain = (self.reference.image, frame.image), self.plain is not None
+        return ImagePair(*images, self.grid, self.material.mask, is_plain=is_plain)
 
     def results(self) -> Mapping[str, NodalResult]:
         """Measure every image, each after the last one that could be; leaves ``results/``.
@@ -416,19 +417,11 @@ def _mean_motion(result: NodalResult) -> dict[str, float]:
 
 
 def measure(
-    reference: Path | str,
-    deformed: Sequence[Path | str],
-    folder: Path | str,
-    *,
-    mask: Path | str | None = None,
-    pixel_size: float | None = None,
-    mesh: Path | str | None = None,
-    brightness: int = 0,
-    choice: FrameChoice | None = None,
-    log: LogTable | None = None,
-    gauges: Path | str | None = None,
-    progress: Progress = silent,
-) -> dict[str, Any]:
+    reference: Path | str, deformed: Sequence[Path | str], folder: Path | str, *,
+    mask: Path | str | None = None, pixel_size: float | None = None, mesh: Path | str | None = None,
+    brightness: int = 0, choice: FrameChoice | None = None, log: LogTable | None = None,
+    gauges: Path | str | None = None, progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
 
     ``deformed`` may also be folders and videos; ``choice`` among their frames; ``log`` of the

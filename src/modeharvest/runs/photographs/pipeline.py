@@ -449,12 +449,9 @@ class HarvestRun(StagedRun[PhotographCase]):
 
 
 def harvest(
-    case: str | Path | CaseModel,
-    folder: Path | str,
-    progress: Progress = silent,
-    whole_field: bool | None = None,
-    contours: bool | None = None,
-) -> dict[str, Any]:
+    case: str | Path | CaseModel, folder: Path | str, progress: Progress = silent,
+    whole_field: bool | None = None, contours: bool | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Harvest modes from photographs of a test; what ``modeharvest harvest`` does.
 
     ``case``: the path of its TOML file, or the case itself; ``folder``: where to leave the files;

@@ -110,7 +110,10 @@ class PreparedPhotographs:
 
     def pair(self, name: str) -> ImagePair:
         """The reference and a deformed photograph."""
-        return ImagePair(self.image(), self.image(name), self.grid, self.mask(), self.mask(name))
+        return ImagePair(
+            self.image(), self.image(name), self.grid, self.mask(), self.mask(name),
+            is_plain=self.is_plain,
+        )  # fmt: skip
 
 
 def of_each_photograph(case: PhotographCase, names: Sequence[str], what: str) -> dict[str, Path]:
@@ -237,11 +240,9 @@ def calibrated_lens(folder: Path) -> Optics:
 
 
 def prepare(
-    case: PhotographCase,
-    folder: Path,
-    distortion: Distortion | None = None,
+    case: PhotographCase, folder: Path, distortion: Distortion | None = None,
     progress: Progress = silent,
-) -> PreparedPhotographs:
+) -> PreparedPhotographs:  # fmt: skip
     """Make a case's photographs ready; leaves them in ``folder``.
 
     Raises InputError if the reference can't be used, or none of the deformed images.
