@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from skimage import measure
 
 from modeharvest.fem.field import Mesh, with_mid_sides
@@ -174,16 +175,15 @@ def _meshed(
 
 def _narrowest(mask: BoolArray) -> float:
     """Width of the material where it is narrowest between two holes, or a hole and outside [px]."""
-    inside = np.pad(mask, 1)
-    nearest = ndimage.distance_transform_edt(inside, None, False, True)
-    hole = ndimage.label(~inside)[0][tuple(nearest)]
-
-    def width(row: IntArray, col: IntArray) -> FloatArray:
-        return np.asarray(np.hypot(*(nearest[:, row, col] - np.stack([row, col]))))
-
-    (r, c), (s, d) = np.nonzero(hole[1:] != hole[:-1]), np.nonzero(hole[:, 1:] != hole[:, :-1])
-    widths = np.concatenate([width(r, c) + width(r + 1, c), width(s, d) + width(s, d + 1)])
-    return float(widths.min(initial=np.inf))
+    outside = np.pad(~mask, 1, constant_values=True)
+    hole, count = ndimage.label(outside)
+    edge = np.nonzero(outside & ndimage.binary_dilation(~outside))
+    own, points, apart = hole[edge], np.stack(edge, axis=1), np.inf
+    for bit in range(count.bit_length()):  # the numbers of any two holes differ in one
+        one = (own >> bit) % 2 == 1
+        gaps, _ = cKDTree(points[one]).query(points[~one], distance_upper_bound=apart)
+        apart = min(apart, gaps.min(initial=np.inf))
+    return float(apart) - 1.0
 
 
 def quadratic(mesh: Mesh) -> Mesh:

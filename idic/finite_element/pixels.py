@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.solver.pyramid import FELT, FULL, Level, LevelPair, eroded, level_pair
@@ -204,13 +205,11 @@ class MeshPixels:
         located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the material")
         _require_cover(located.mask, mask)
         flat = np.flatnonzero(mask & located.mask)
-        element = located.element.ravel()[flat]
-        order = np.argsort(element, kind="stable")
-        flat, element = flat[order], element[order]
-        row, col = np.divmod(flat, grid.cols)
-        start = np.searchsorted(element, np.arange(len(mesh.cells) + 1))
-        xi = located.values.reshape(2, -1)[:, flat].astype(np.float32)
-        none = np.empty((2, 0), np.float32)
+        where, ones = (located.element.ravel()[flat], flat), np.ones(flat.size, np.int8)
+        by_element = csr_array((ones, where), shape=(len(mesh.cells), mask.size))
+        row, col = np.divmod(by_element.indices, grid.cols)
+        xi = located.values.reshape(2, -1)[:, by_element.indices].astype(np.float32)
+        none, start = np.empty((2, 0), np.float32), by_element.indptr.astype(np.int64)
         return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, none[0], none)
 
 
