@@ -417,8 +417,9 @@ class _Measurement:
         blank = float(counts[at.signal == 0.0].sum() / counts.sum())
         if blank > _BLANK:
             self.warnings += (
-                f"{100 * blank:.0f} % of the material shows no speckle that is in both images: there "
-                "the displacement is the smoothest that fits around, its standard deviation a guess.",
+                f"{100 * blank:.0f} % of the material shows no speckle that is in both images: "
+                "there the displacement is the smoothest that fits around, and its standard "
+                "deviation a guess.",
             )
         return NodalResult(
             mesh=self.body.mesh,
