@@ -8,6 +8,7 @@ match. A material states its energy; the rest is derived.
 from __future__ import annotations
 
 from copy import copy
+from functools import partial
 from typing import Any
 
 import dolfinx
@@ -22,6 +23,10 @@ from modeharvest.fem.materials import Material
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
+_form = partial(
+    dolfinx.fem.form, jit_options={"cffi_extra_compile_args": ["-O3", "-ffast-math", "-g0"]}
+)
+"""Compiles a form whose sums may be reordered: assembly takes two thirds of the time."""
 _CORNERS_AND_MIDDLES = 0.5 * np.array([[0, 0], [2, 0], [0, 2], [1, 1], [0, 1], [1, 0]])
 
 
@@ -54,17 +59,16 @@ class Hyperelastic:
         rule = {"quadrature_degree": 2 * degree - 2}  # for 2 on a triangle: three Gauss points
         energy = material.energy(F) * ufl.Measure("dx", domain=domain, metadata=rule)
         self._forces: Any = ufl.derivative(energy, self.u, test)
-        form = dolfinx.fem.form
-        self.energy: Any = form(energy)
-        self.forces: Any = form(self._forces)
-        self.stiffness: Any = form(ufl.derivative(self._forces, self.u, trial))
-        self.mass: Any = form(ufl.inner(trial, test) * ufl.dx(domain))
+        self.energy: Any = _form(energy)
+        self.forces: Any = _form(self._forces)
+        self.stiffness: Any = _form(ufl.derivative(self._forces, self.u, trial))
+        self.mass: Any = _form(ufl.inner(trial, test) * ufl.dx(domain))
         self._det_f = dolfinx.fem.Expression(ufl.det(F), _CORNERS_AND_MIDDLES)
         self._own_cells = np.arange(domain.topology.index_map(2).size_local, dtype=np.int32)
 
     def stiffness_along(self, direction: dolfinx.fem.Function) -> Any:
         """The form of the stiffness times a displacement: how forces change along it."""
-        return dolfinx.fem.form(ufl.derivative(self._forces, self.u, direction))
+        return _form(ufl.derivative(self._forces, self.u, direction))
 
     def sampled(self, points: FloatArray) -> csr_array:
         """Matrix (m k, n) from V's nodes to points (k, 2) of m elements in order; on one rank."""

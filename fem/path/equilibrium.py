@@ -67,14 +67,9 @@ class Structure:
     """
 
     def __init__(
-        self,
-        mesh: Mesh,
-        material: Material,
-        loading: EdgeCompression,
-        comm: MPI.Comm = MPI.COMM_WORLD,
-        parametric: bool = False,
-        degree: int = 2,
-    ) -> None:
+        self, mesh: Mesh, material: Material, loading: EdgeCompression,
+        comm: MPI.Comm = MPI.COMM_WORLD, parametric: bool = False, degree: int = 2,
+    ) -> None:  # fmt: skip
         self.mesh, self.comm, self.nodes = mesh, comm, mesh.nodes
         self._forms = Hyperelastic(mesh, material, comm, parametric, degree)
         self.shown, self._quadratic, self._sampled = mesh, self._forms.V, None
