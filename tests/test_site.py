@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -133,6 +134,29 @@ def test_equations_are_markup(site: Path) -> None:
 def test_references_are_drawn_from_the_code(site: Path, page: str, texts: list[str]) -> None:
     text = (site / f"generated/{page}.html").read_text("utf-8")
     assert [t for t in texts if t.lower() not in text.lower()] == []
+
+
+@pytest.mark.dolfinx
+def test_every_key_has_a_meaning_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs/_ext"))
+    import key_pages
+
+    models = [model for _, model, _ in key_pages.CASES.values()]
+    tables = [table for model in models for table in key_pages.tables(model)]
+    assert len(tables) > 50
+    for path, cls in tables:
+        rows = list(key_pages.keys(cls, path))
+        meanings = [meaning for *_, meaning in rows]
+        assert len(set(meanings)) == len(meanings), path
+        for name, _, _, default, span, meaning in rows:
+            assert meaning, (path, name)
+            assert not {":class:", ":data:"} & set(re.findall(r":\w+:", meaning)), (path, name)
+            assert "nan" not in default, (path, name)
+            low, to, high = span.partition(" to ")
+            assert not to or low != high, (path, name)
+    named = {base.__name__: base for _, cls in tables for base in cls.__mro__}
+    for name, own in key_pages.MEANINGS.items():
+        assert own.keys() <= {f.name for f in fields(named[name])}, name
 
 
 @pytest.mark.dolfinx

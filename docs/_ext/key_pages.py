@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 import re
 import textwrap
+import tomllib
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields, is_dataclass, replace
@@ -28,6 +30,7 @@ from modeharvest.runs.homogenization.case import MODES, FileMode, Homogenization
 from modeharvest.runs.identification.case import IdentificationCase, MeasuredData, OtherLaw
 from modeharvest.runs.lattice.case import LATTICES, FileLattice, LatticeCase
 from modeharvest.runs.photographs.case import Images, ImageScale, PhotographCase
+from modeharvest.runs.photographs.machine_log import LogTable
 from modeharvest.runs.study import KINDS, StudyCase
 
 CASES: dict[str, tuple[str, type[CaseModel], str]] = {
@@ -50,9 +53,14 @@ EXAMPLES: dict[type[Any], dict[str, Any]] = {
     SpecimenTable: {"cell_size": 1.9},
     FileLattice: {"path": "cell.msh", "pitch": 1.9},
     FileMode: {"path": "modes.h5"},
+    LogTable: {"file": "log.csv"},
     MeasuredData: {"reference": "reference.tif", "deformed": ("f.tif",), "pixel_size": 0.01},
 }
 """Values of keys that have no default."""
+MEANINGS: dict[str, dict[str, str]] = tomllib.loads(
+    Path(__file__).with_name("keys.toml").read_text("utf-8")
+)
+"""Of keys whose classes don't say it for each alone."""
 NUMBERS = sorted(
     sign * value
     for value in (0.0, 1e-9, 1e-6, 1e-3, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, *range(1, 17), 20.0, 30.0,
@@ -67,7 +75,7 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if base.__module__.startswith("modeharvest"):
-            found |= below_fields(base) | in_parameters(base)
+            found |= below_fields(base) | in_parameters(base) | MEANINGS.get(base.__name__, {})
     return found
 
 
@@ -255,7 +263,8 @@ def keys(cls: type[Any], path: str) -> Iterator[tuple[str, ...]]:
         default = None if f.default is MISSING else f.default
         if f.default is MISSING and f.default_factory is not MISSING:
             default = f.default_factory()
-        needed = f.default is MISSING and f.default_factory is MISSING
+        none = f.default is MISSING and f.default_factory is MISSING
+        needed = none or (isinstance(default, float) and math.isnan(default))
         shown = "required" if needed else "" if default is None else f"``{literal(default)}``"
         text = about.get(f.name, "") or f.metadata.get("label", "")
         of = f.metadata.get("unit") or unit(f.name, text, kind)
@@ -266,6 +275,13 @@ def keys(cls: type[Any], path: str) -> Iterator[tuple[str, ...]]:
 def escaped(text: str) -> str:
     """Not to be taken for marks of reStructuredText."""
     return re.sub(r"([*_`|\\])", r"\\\1", text)
+
+
+def tables(model: type[CaseModel]) -> Iterator[tuple[str, type[Any]]]:
+    """All tables of a kind of case by their names in a file, with the class of each."""
+    hints = get_type_hints(model, include_extras=True)
+    for name in model.model_fields:
+        yield from ((path, cls) for path, cls, _ in below(name, hints[name], name))
 
 
 HEAD = "key", "type", "unit", "default", "range", "meaning"
