@@ -34,6 +34,7 @@ from modeharvest.idic.photograph.displacement import block_motion, displacement_
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import write_image
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.runs.measure import measure
 from modeharvest.util.errors import InputError
 
@@ -305,6 +306,38 @@ def test_start_follows_what_no_polynomial_does() -> None:
     # Whole pixels, and a block of 41 px is blind to a tenth of such a wave's 8 px.
     assert np.median(off[inner]) < 1.5
     assert np.quantile(off[inner], 0.99) < 4.0
+
+
+@pytest.mark.parametrize(("size_px", "amplitude_px"), [(5.0, 0.0), (12.0, 0.0), (5.0, 0.2)])
+def test_error_bars_of_a_smooth_displacement_count_the_start_s_noise(
+    size_px: float, amplitude_px: float
+) -> None:
+    """It comes from the same images: what is left of their noise in it was counted by nothing.
+
+    Errors were seven times the standard deviation, and as many times larger than they need be.
+    """
+    pixel, shape = 0.01, (240, 320)
+    grid = PixelGrid.centred(*shape, pixel)
+
+    def u(points: np.ndarray) -> np.ndarray:
+        x, y = np.moveaxis(points, -1, 0)
+        wave = amplitude_px * pixel * np.sin(2.0 * np.pi * x / (200.0 * pixel))
+        return np.stack([0.013 + 0.02 * x + wave, 0.004 - 0.01 * y + wave], axis=-1)
+
+    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+    speckles, rng = SpeckleSpec(0.5 / size_px, blur_px=0.3 * size_px), np.random.default_rng(1)
+    pattern = Speckle(speckles, shape)
+    images = [
+        pattern(*grid.to_px(x[..., 0], x[..., 1])) + 0.01 * rng.standard_normal(shape)
+        for x in (at, inverted(u, at, 1e-9))
+    ]
+    pair, body = ImagePair(*images, grid), FiniteElementOptions().body(np.ones(shape, bool), grid)
+    nodes = body.mesh.nodes
+    found = displacement_from(block_motion(pair, body, 0.0 * nodes), pair, body)
+    seen = (np.abs(nodes + u(nodes)) < [grid.x[-3], grid.y[2]]).all(axis=1)
+    off, sd = np.abs(found.displacement - u(nodes))[seen], found.standard_deviation[seen]
+    assert 0.8 < np.mean(off < 1.96 * sd)
+    assert np.sqrt(np.mean(off**2)) < 1.3 * np.sqrt(np.mean(sd**2))
 
 
 def error_from(

@@ -179,7 +179,7 @@ def coarse_displacement(
     for stage in (*_STAGES, _Stage(FULL, _FIRST_PX)):
         course.through(stage)
     sums, pixels = course.linearised().sums, course._prepare(FULL).pixels
-    unlike = sums.squares > _UNLIKE * float(pixels.grey.var()) * sums.weights
+    unlike = sums.squares > (_UNLIKE * float(pixels.grey.var()) + sum(course.noise)) * sums.weights
     unlike |= sums.counts < _SEEN * np.diff(pixels.start)
     return course.u.reshape(-1, 2), ~np.isin(np.arange(len(on.mesh.nodes)), on.mesh.cells[unlike])
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,9 @@ _DENSER = 5, 16
 """
 _SMOOTH_PX = 60.0
 """Shorter waves of a start are what a spline makes of whole pixels, and would stay."""
+_FEW, _MANY = 1.3, 4.0
+"""Cut-off over the shortest wave of its start from which on that is too short, and waves of another
+start over it, which will do if the images don't ask for a shorter one then."""
 _STRAY = 8.0
 """Times the spread of its neighbours' motion that a block may be off their median."""
 _FIRST = FiniteElementOptions(edge_px=4)
@@ -102,7 +106,17 @@ def displacement_from(
         before, unknown = unknown, int((~known).sum())
         if sweep and not 0 < unknown < before:
             break
-    return measure_displacement(seen(_AT_EDGE_PX), start, body, options=options, progress=progress)
+    measured = partial(measure_displacement, on=body, options=options, progress=progress)
+    pair_alike = seen(_AT_EDGE_PX)
+    found = measured(pair_alike, start)
+    if found.cutoff_px is None or found.cutoff_px < _FEW * _SMOOTH_PX:
+        return found
+    # Shorter waves of the start are noise of the same images, which nothing would count.
+    wave = found.cutoff_px * pair.grid.pixel_size
+    smoother = measured(pair_alike, body.smoothed(start, _MANY * wave))
+    if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
+        return smoother
+    return measured(pair_alike, body.smoothed(start, wave))
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:

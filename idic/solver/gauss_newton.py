@@ -154,15 +154,10 @@ _LEAST_CURVATURE = 0.05
 
 
 def minimise(
-    evaluate: Evaluate,
-    step_length: StepLength,
-    start: FloatArray,
-    options: GaussNewtonOptions,
-    factor: int = 1,
-    on_iteration: Callable[[int], None] = lambda number: None,
-    curvature: FloatArray | None = None,
-    eigenvalue_cutoff: float = 0.0,
-) -> Minimum:
+    evaluate: Evaluate, step_length: StepLength, start: FloatArray, options: GaussNewtonOptions,
+    factor: int = 1, on_iteration: Callable[[int], None] = lambda number: None,
+    curvature: FloatArray | None = None, eigenvalue_cutoff: float = 0.0,
+) -> Minimum:  # fmt: skip
     """Minimise 1/2 sum r^2.
 
     evaluate : The normal equations at some unknowns, and whether with the matrix.

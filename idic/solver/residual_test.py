@@ -117,14 +117,9 @@ class ResidualTest:
 
     @classmethod
     def of(
-        cls,
-        residual_rms: float,
-        correlation: float,
-        pixels: int,
-        unknowns: int,
-        noise_sd: float | None = None,
-        lags_px: tuple[int, ...] = LAGS_PX,
-    ) -> ResidualTest:
+        cls, residual_rms: float, correlation: float, pixels: int, unknowns: int,
+        noise_sd: float | None = None, lags_px: tuple[int, ...] = LAGS_PX,
+    ) -> ResidualTest:  # fmt: skip
         """Test a residual of rms [grey levels], :func:`autocorrelation` and number of pixels.
 
         unknowns : Number of fitted unknowns.

@@ -87,14 +87,9 @@ class Spectrum:
 
 
 def spectral_density(
-    displacement: FloatArray,
-    grid: PixelGrid,
-    mask: BoolArray,
-    pitch: float,
-    *,
-    bins_per_cell: int = 24,
-    padding: int = 4,
-) -> Spectrum:
+    displacement: FloatArray, grid: PixelGrid, mask: BoolArray, pitch: float, *,
+    bins_per_cell: int = 24, padding: int = 4,
+) -> Spectrum:  # fmt: skip
     """Transform a displacement field (rows, cols, 2) [mm], along x and y (up), given at pixels.
 
     InputError if shapes differ, the mask is all black, or the displacement is not finite in it.
