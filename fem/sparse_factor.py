@@ -14,6 +14,7 @@ from scipy.sparse import csc_matrix, csr_array
 from scipy.sparse.linalg import splu
 
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import SingularMatrixError
 
 
 def factorise(
@@ -21,7 +22,7 @@ def factorise(
 ) -> Factor:
     """Factorise a symmetric matrix, of sorted indices.
 
-    ModuleNotFoundError: the library named isn't there. ArithmeticError: singular, here or updated.
+    ModuleNotFoundError: the library named isn't there. SingularMatrixError, here or updated.
 
     matrix : (n, n), both triangles.
     library : a name among ``LIBRARIES``; by default MUMPS if it is there.
@@ -39,11 +40,10 @@ class _Mumps:
         from petsc4py import PETSc
 
         # The arrays are shared, so that new values need no call for each row.
-        kinds = PETSc.IntType, PETSc.IntType, PETSc.ScalarType
-        parts = matrix.indptr, matrix.indices, matrix.data
-        self._arrays = tuple(a.astype(kind) for a, kind in zip(parts, kinds, strict=True))
-        shape = matrix.shape
-        self._matrix = PETSc.Mat().createAIJWithArrays(shape, self._arrays, comm=PETSc.COMM_SELF)
+        rows = (part.astype(PETSc.IntType) for part in (matrix.indptr, matrix.indices))
+        self._arrays = *rows, matrix.data.astype(PETSc.ScalarType)
+        given = matrix.shape, self._arrays
+        self._matrix = PETSc.Mat().createAIJWithArrays(*given, comm=PETSc.COMM_SELF)
         self._matrix.setOption(PETSc.Mat.Option.SPD, definite)
         self._pc = PETSc.PC().create(PETSc.COMM_SELF)
         self._pc.setOperators(self._matrix)
@@ -62,7 +62,7 @@ class _Mumps:
         self._matrix.stateIncrease()
         self._pc.setUp()
         if (code := self._factor.getMumpsInfog(1)) < 0:
-            raise ArithmeticError(f"MUMPS failed with INFOG(1) = {code}")
+            raise SingularMatrixError(f"MUMPS, INFOG(1) = {code}")
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         from petsc4py import PETSc
@@ -91,7 +91,7 @@ class _SuperLU:
                 options={"SymmetricMode": True},
             )  # fmt: skip
         except RuntimeError as error:
-            raise ArithmeticError(f"SuperLU failed: {error}") from error
+            raise SingularMatrixError(f"SuperLU, {error}") from error
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return np.asarray(self._factor.solve(rhs))

@@ -249,6 +249,14 @@ def test_dragging_moves_all_panels(tab: Tab) -> None:
     assert moved == pytest.approx(-40 / scale, rel=0.1)
 
 
+def test_colour_limits_have_their_unit_beside_them(tab: Tab, content: Any) -> None:
+    residual = [quantity["key"] for quantity in content["quantities"]].index("residual")
+    tab.run(f"explorer.shared.unit = 2; explorer.panels[1].quantity = {residual}; 0")
+    units = "explorer.panels.map(p => p.element.querySelector('.ex-unit').textContent)"
+    assert tab.run(f"explorer.draw().then(() => {units})") == ["px", "of full scale, or levels"]
+    tab.run("explorer.shared.unit = 0; explorer.panels[1].quantity = 1; explorer.draw()")
+
+
 def test_blinking_switches_truth_and_measurement(tab: Tab, content: Any) -> None:
     left, top, width, height = box(tab)
     tab.click(left + 0.35 * width, top + 0.3 * height)

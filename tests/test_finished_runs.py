@@ -132,6 +132,7 @@ def test_what_cannot_be_done_is_one_line(
     for arguments, words in (
         (("animate", run, "--field", "strain"), "expected a field's component, got 'strain'"),
         (("animate", run, "--as", "avi"), "expected --as gif, mp4 or pdf, got 'avi'"),
+        (("animate", run, *2 * ("--photograph", "none.tif")), "at none.tif, found no such file"),
         (("export", run, "--as", "xls", "--out", tmp_path), "expected a format among ncorr"),
         (("gauges", tmp_path, run / "gauges.toml"), "expected a folder of 'measure'"),
     ):

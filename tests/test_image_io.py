@@ -94,6 +94,18 @@ def test_full_mask_is_fine_and_black_mask_is_not(tmp_path: Path) -> None:
     assert "black.tif" in refusal(error)
 
 
+def test_soft_edges_of_a_mask_count_from_half_on_and_labels_all(tmp_path: Path) -> None:
+    write_image(tmp_path / "soft.tif", np.round(255.0 * RAMP).astype(np.uint8))
+    np.testing.assert_array_equal(read_mask(tmp_path / "soft.tif"), np.round(255 * RAMP) > 127.5)
+    labels = np.digitize(RAMP, [0.3, 0.5, 0.9]).astype(np.uint8)
+    write_image(tmp_path / "labels.tif", labels)
+    np.testing.assert_array_equal(read_mask(tmp_path / "labels.tif"), labels > 0)
+    write_image(tmp_path / "grey.tif", np.where(RAMP > 0.3, 220, 40).astype(np.uint8))
+    with pytest.raises(InputError, match="no black at all, levels from 40 to 220") as error:
+        read_mask(tmp_path / "grey.tif")
+    refusal(error)
+
+
 @pytest.mark.parametrize("read", [read_image, read_mask])
 @pytest.mark.parametrize("name", ["a.tif", "a.png"])
 def test_missing_file(tmp_path: Path, read: Any, name: str) -> None:

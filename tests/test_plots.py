@@ -33,7 +33,7 @@ from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
 from modeharvest.report.figures.style import BLUE, INK, MUTED, SIGNED, to_svg
 
 UNITS = {"µm", "mm⁶"}
-FRACTIONS = {"image", "residual"}  # of full scale: grey levels have no unit
+FRACTIONS = {"image", "residual"}  # of full scale
 
 
 PANELS = [panel for panel in snapshot_panels(1) if panel.section != "whole"]
@@ -65,7 +65,7 @@ def test_every_panel_states_the_unit_of_its_colours(
 ) -> None:
     units = colour_bar_units(panel.draw(states[1]))
     if panel.key in FRACTIONS:
-        assert units == [""]
+        assert units == ["full scale"]
     else:
         assert set(units) <= UNITS
     assert len(units) == (0 if panel.key == "phi1" else 1)  # a deformed shape has no colours
@@ -208,9 +208,11 @@ def test_each_level_of_the_correlation_is_a_curve(data: ExperimentData) -> None:
 
 def test_the_svg_stands_on_its_own(states: list[SnapshotState]) -> None:
     svg = to_svg(draw_hero(states[1]), "hero", 'a "title" & more')
-    head = re.match(r'<svg viewBox="0 0 ([\d.]+) [\d.]+" style="max-width: (\d+)px"', svg)
+    sizes = 'style="max-width: (\\d+)px; --least: (\\d+)px"'
+    head = re.match(r'<svg viewBox="0 0 ([\d.]+) [\d.]+" ' + sizes, svg)
     assert head is not None
     assert float(head[2]) == pytest.approx(float(head[1]) * 150.0 / 72.0, abs=0.5)
+    assert float(head[3]) == pytest.approx(float(head[1]) * 90.0 / 72.0, abs=0.5)
     assert svg.endswith("</svg>")
     assert 'aria-label="a &quot;title&quot; &amp; more"' in svg
     ids = re.findall(r'\bid="([^"]+)"', svg)

@@ -68,9 +68,11 @@ def without_mesh(modes: int) -> list[fits.Panel[SnapshotState]]:
 
 
 def test_texts_write_numbers_for_a_reader() -> None:
-    row = {"nominal_strain": 0.128, "branch_N": 1.23456e-5, "unstable_N": 2.0}
+    row = {"nominal_strain": 0.128, "branch_N": 1.23456e-5, "unstable_N": 1.53}
     words = text_of("experiment-energy", **row)
-    assert words.startswith("At 12.8\u00a0% the buckled state stores an energy of 1.2 · 10⁻⁵ N·mm")
+    assert words.startswith("At 12.8\u00a0% the buckled state stores an energy per thickness of ")
+    assert " of 1.2 · 10⁻⁵ N·mm/mm, " in words
+    assert words.endswith(" 1.530 N·mm/mm.")
     key = KeyNumber.of("cutoff", last={"cutoff_px": 12.3456})
     assert (key.name, key.value, key.unit) == ("cut-off wavelength", "12.3", "px")
 

@@ -100,6 +100,10 @@ def test_two_photographs_of_one_name_are_one(tmp_path: Path) -> None:
     found = chosen(tmp_path, "shots")
     assert len(found.deformed) == 2
     assert [reason for _, reason in found.skipped] == ["another photograph has this name"]
+    folder_of(tmp_path / "later", ["f1"])  # as a shell names them
+    found = chosen(tmp_path, "shots/f1.tif", "later/f1.tif")
+    assert len(found.deformed) == 1
+    assert [reason for _, reason in found.skipped] == ["another photograph has this name"]
 
 
 def test_frames_are_chosen(tmp_path: Path) -> None:

@@ -272,6 +272,9 @@ def test_the_command(
     shots = tmp_path / "few"
     shots.mkdir()
     (shots / "frame_1.tif").write_bytes((experiment.parent / "shots/frame_1.tif").read_bytes())
+    still = "--until-still", "0.5", "--out", tmp_path / "out"
+    assert called(monkeypatch, "harvest", experiment, *still) == 2
+    assert "expected --watch FOLDER beside --until-still" in capsys.readouterr().err
     code = called(monkeypatch, "harvest", experiment, "--watch", shots, "--until-still", "0.5",
                   "--out", tmp_path / "out")  # fmt: skip
     printed = capsys.readouterr().out

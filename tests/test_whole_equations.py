@@ -24,6 +24,7 @@ from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.elements import shape_functions
+from modeharvest.util.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +166,18 @@ def test_factor_solves_and_takes_new_values(library: str, block: int) -> None:
     np.testing.assert_allclose(matrix @ factor.solve(right), right, atol=1e-12)
     factor.update(2.0 * matrix)
     np.testing.assert_allclose(2.0 * matrix @ factor.solve(right[:, 0]), right[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("library", [*LIBRARIES])
+def test_a_singular_matrix_is_the_data_s_fault(library: str) -> None:
+    if library == "mumps":
+        pytest.importorskip("petsc4py")
+    whole = np.diag([1.0, 2.0, 3.0])
+    factor = factorise(csr_array(whole), library)
+    singular = csr_array(whole)
+    singular.data[1] = 0.0
+    with pytest.raises(InputError, match="determine every unknown, got a singular matrix"):
+        factor.update(singular)
 
 
 def test_libraries_agree() -> None:

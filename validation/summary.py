@@ -107,7 +107,7 @@ class SnapshotSummary:
     rms_idic_to_best_fit_px: float = quantity("measurement error: IDIC − best fit, rms", "px")
     rms_residual: float = quantity("residual, rms, as a fraction of full scale", "–")
     pixels: int = quantity("pixels compared", "–")
-    iterations: int = quantity("iterations on the full image", "–")
+    iterations: int = quantity("iterations at full resolution", "–")
     iterations_all_levels: int = quantity("iterations on all levels", "–")
     condition_number: float = quantity("condition number", "–")
     residual_correlation: float = quantity("autocorrelation of the residual, 4 to 12 px", "–")

@@ -3,7 +3,9 @@ Strain of a speckled plate with a hole
 ======================================
 
 No lattice and no mode: ``measure`` needs two images and gives displacement and strain up to the
-edge of the hole, with standard deviations. The images here are made from a formula.
+edge of the hole, with standard deviations. The images here are made from a formula that stretches
+and bends the plate as if there were no hole: strain doesn't concentrate there, as it would in a
+loaded plate.
 """
 
 import tempfile
@@ -39,7 +41,9 @@ numbers = summary["images"][0]
 print({key: numbers[key] for key in ("rms_px", "median_sd_px", "coverage", "cutoff_px")})
 
 # %%
-# The result for ParaView is a mesh with all fields at its nodes; matplotlib draws it as well.
+# The result for ParaView is a mesh with all fields at its nodes; matplotlib draws it as well. By
+# the formula the strain along x is 4.1 % in the middle and 4.7 % at both ends, where the plate is
+# bent most.
 
 mesh = meshio.read(folder / "out/results/deformed.vtu")
 E = np.asarray(mesh.point_data["green_lagrange"]).reshape(len(mesh.points), -1)[:, 0]

@@ -42,18 +42,20 @@ cell_size = 1.9                # mm
 summary = mh.harvest(folder / "experiment.toml", folder / "out")
 
 # %%
-# Standard deviations by the camera's noise, and by model error.
+# Standard deviations by the camera's noise, and by model error. a1 to a5 are numbers, a6 and a7
+# lengths.
 
 mode = summary["frames"][-1]["modes"][0]
 print(summary["frames"][-1]["outcome"], "in", summary["frames"][-1]["iterations"], "iterations")
 names = [p["name"] for p in mode["parameters"]]
 off = np.array([p["value"] for p in mode["parameters"]]) - [1, 1, 1, -1, 1, 0, 0]
-fig, ax = plt.subplots(figsize=(7, 4), layout="constrained")
-for shift, key, label in ((-0.1, "sd_noise", "noise"), (0.1, "sd_model_error", "model error")):
-    deviation = np.array([p[key] for p in mode["parameters"]])
-    place = np.arange(len(names)) + shift
-    ax.errorbar(place, off, 2 * deviation, fmt="o", capsize=3, label=f"two sd by {label}")
-ax.axhline(0.0, color="k", lw=0.8)
-ax.set_xticks(range(len(names)), names)
-ax.set(ylabel="parameter of φ₁ less that of the ideal pattern")
-ax.legend()
+fig, axes = plt.subplots(1, 2, figsize=(7.5, 4), width_ratios=(5, 2), layout="constrained")
+for ax, some, unit in zip(axes, (range(5), range(5, 7)), ("-", "mm"), strict=True):
+    for shift, key, label in ((-0.1, "sd_noise", "noise"), (0.1, "sd_model_error", "model error")):
+        deviation = [2 * mode["parameters"][k][key] for k in some]
+        place = np.array(some) + shift
+        ax.errorbar(place, off[some], deviation, fmt="o", capsize=3, label=f"two sd by {label}")
+    ax.axhline(0.0, color="k", lw=0.8)
+    ax.set_xticks(some, [names[k] for k in some])
+    ax.set(xlim=(some[0] - 0.6, some[-1] + 0.6), ylabel=f"parameter of φ₁ − ideal value [{unit}]")
+axes[0].legend()

@@ -36,11 +36,13 @@ field = read_field(folder / "vic.csv", pair.grid, units="px", y_axis="down")
 print(f"{field.x.size} points, {field.lost} of them failed, rms {field.rms:.3f} mm")
 
 # %%
-# Peaks at half a wave a cell along both axes: neighbouring holes deform in opposite ways.
+# Peaks at half a wave a cell along both axes: neighbouring holes deform in opposite ways. Colours
+# show the four decades below the largest.
 
 spectrum = measured_spectrum(field, solution.specimen.pitch)
 xi1, xi2, density = spectrum.window(1.2)
 fig, ax = plt.subplots(figsize=(5.6, 4.6), layout="constrained")
-shown = ax.pcolormesh(xi1, xi2, np.log10(density.sum(axis=-1)))
+decades = np.log10(density.sum(axis=-1))
+shown = ax.pcolormesh(xi1, xi2, decades, vmin=decades.max() - 4)
 ax.set(xlabel="ξ₁ [1/l]", ylabel="ξ₂ [1/l]", aspect="equal", title="spectral density of u")
-fig.colorbar(shown, label="log₁₀ of mm⁶")
+fig.colorbar(shown, label="log₁₀ of mm⁶", extend="min")

@@ -19,19 +19,21 @@ from modeharvest.fem.materials import TwoTermI1
 cell = PeriodicCell(square(pitch=1.9, diameter=1.65, size=0.2), TwoTermI1())
 critical = first_critical(CellPath(cell, equibiaxial()))
 print(critical.outcome)
-print(f"at {100 * critical.load:.2f} %, waves (phases over π)", np.round(critical.waves, 3) / np.pi)
+print(f"at {100 * critical.load:.2f} %, phases over π:", np.divide(critical.waves, np.pi).round(3))
 
 # %%
-# The mode on the smallest cell that repeats it, 2 x 2 holes.
+# The mode on the smallest cell that repeats it, 2 x 2 holes, enlarged; colours are its length.
 
 modes = real_modes(cell, critical.state, critical.waves)
-fig, axes = plt.subplots(1, 2, figsize=(9, 4.4), layout="constrained")
+count = len(modes.waves)
+fig, axes = plt.subplots(1, count, figsize=(5.4 * count, 4.4), squeeze=False, layout="constrained")
 corners = modes.mesh.cells[:, :3]
-for ax, shape, wave in zip(axes, modes.shapes, modes.waves, strict=False):
+for ax, shape, wave in zip(axes[0], modes.shapes, modes.waves, strict=True):
     moved = modes.mesh.nodes + 0.25 * shape / np.abs(shape).max()
+    size = np.linalg.norm(shape, axis=1)
     ax.triplot(*moved.T, corners, lw=0.6, color="0.3")
-    ax.tripcolor(*moved.T, corners, np.linalg.norm(shape, axis=1), shading="gouraud", alpha=0.9)
-    ax.set(aspect="equal", title=f"phases {np.round(np.divide(wave, np.pi), 2)} π")
+    shown = ax.tripcolor(*moved.T, corners, size / size.max(), shading="gouraud", alpha=0.9)
+    phases = ", ".join(f"{phase / np.pi:.3g} π" for phase in wave)
+    ax.set(aspect="equal", title=f"phases (k·a₁, k·a₂) = ({phases})")
     ax.set_axis_off()
-for ax in axes[len(modes.waves) :]:
-    ax.remove()
+    fig.colorbar(shown, label="‖φ‖ over its largest value [-]")

@@ -43,7 +43,7 @@ def export_field(
     if form not in FORMATS:
         raise InputError(f"expected a format among {', '.join(FORMATS)}, got {form!r}")
     if unit == "px" and form in ("matchid", "gom", "csv", "npz", "mat"):
-        raise InputError(f"expected the size of a pixel for {form}, which is in mm; give it")
+        raise InputError(f"expected the size of a pixel for {form}, in mm; measure with it")
     path = Path(path).with_suffix(FORMATS[form])
     if form in (texts := layouts()["written"]):
         _write_text(path, texts[form], _numbers(field, grid))

@@ -59,7 +59,7 @@ class FinishedRun:
             known = dict(zip(files, photographs, strict=True))
         with open_hdf5(paths[0], "a measured displacement (HDF5)") as file:
             unit = str(file.attrs["unit"])
-        return cls(files, {name: path for name, path in known.items() if path.is_file()}, unit)
+        return cls(files, {n: p for n, p in known.items() if photographs or p.is_file()}, unit)
 
     def result(self, name: str) -> NodalResult:
         """An image's displacement, with the roots of its covariance."""

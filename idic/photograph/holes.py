@@ -250,7 +250,7 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
     if cell_px is not None and (not cell_px > 0 or abs(off) > _WRONG_CELL):
         raise InputError(
             f"expected a cell size near {apart:.1f} px, the distance of neighbouring holes in the "
-            f"image, got {cell_px:.1f} px ({100 * off:+.0f} %); correct the cell size or pixel size"
+            f"image, got {cell_px:.3g} px ({100 * off:+.0f} %); correct the cell size or pixel size"
         )
     return found
 

@@ -138,15 +138,10 @@ class Assembly:
         return result
 
     def images(
-        self,
-        a: FloatArray,
-        reference: NDArray[Any],
-        deformed: SplineImage,
-        with_matrix: bool = True,
-        instrument: NDArray[Any] | None = None,
-        share: float = 1.0,
+        self, a: FloatArray, reference: NDArray[Any], deformed: SplineImage,
+        with_matrix: bool = True, instrument: NDArray[Any] | None = None, share: float = 1.0,
         runs: Runs | None = None,
-    ) -> NormalEquations:
+    ) -> NormalEquations:  # fmt: skip
         """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
 
         With brightness among the unknowns r = f - (1 + b) g(x + u) - c.

@@ -133,15 +133,9 @@ class FoundFamily:
 
 
 def mode_family(
-    mesh: Mesh,
-    lattice: ArrayLike,
-    values: ArrayLike,
-    pitch: float,
-    *,
-    shared: bool = True,
-    growth: float = GROWTH,
-    info: Mapping[str, Any] | None = None,
-) -> FoundFamily:
+    mesh: Mesh, lattice: ArrayLike, values: ArrayLike, pitch: float, *, shared: bool = True,
+    growth: float = GROWTH, info: Mapping[str, Any] | None = None,
+) -> FoundFamily:  # fmt: skip
     """Find the truncated Fourier series of a periodic field, and make it a family.
 
     mesh, lattice, values, pitch : As for

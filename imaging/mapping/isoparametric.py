@@ -148,14 +148,9 @@ class _Buckets(NamedTuple):
 
 
 def locate_points(
-    nodes: FloatArray,
-    cells: IntArray,
-    element: str,
-    grid: PixelGrid,
-    row: ArrayLike,
-    col: ArrayLike,
-    where: str = "mesh",
-) -> Located:
+    nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid, row: ArrayLike,
+    col: ArrayLike, where: str = "mesh",
+) -> Located:  # fmt: skip
     """Find element and local coordinates of points given by their image positions.
 
     Points beside the mesh, and NaN, belong to no element; how many lie inside more than one is not

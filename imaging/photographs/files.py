@@ -28,6 +28,8 @@ from modeharvest.util.files import atomic, reading, require_plausible
 LUMA = (0.2125, 0.7154, 0.0721)
 """Weights of red, green and blue in a grey level."""
 _TIFF = {".tif", ".tiff"}
+_LABELS = 16
+"""Levels of a mask, at most, of which each may stand for an island."""
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it would print beside our line
 _ORIENTATION = 274
 """The tag of TIFF and of Exif."""
@@ -227,15 +229,21 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
 def read_mask(path: Path | str) -> BoolArray:
     """Read a mask (rows, cols): True where the file isn't zero, that is, where there is material.
 
-    InputError if the file is missing, cut short, not one plane image, zero everywhere, or holds
-    NaN or infinity.
+    Of a mask with soft edges, which have many levels, those above half of the largest count.
+    InputError if the file is missing, cut short, not one plane image, zero everywhere, of several
+    levels without zero, or holds NaN or infinity.
     """
     levels = read_stored(Path(path), single=True).levels
     if not np.isfinite(levels).all():
         raise InputError(f"expected a mask of finite numbers at {path}, got NaN or infinity")
-    mask = (levels if levels.ndim == 2 else levels.max(axis=2)) != 0
+    levels = levels if levels.ndim == 2 else levels.max(axis=2)
+    low, high = levels.min(), levels.max()
+    mask = levels > (0.5 * high if len(np.unique(levels)) > _LABELS else 0)
     if not mask.any():
         raise InputError(f"expected a mask with material (above 0) at {path}, got black everywhere")
+    if low > 0 and low != high:
+        got = f"no black at all, levels from {low} to {high}"
+        raise InputError(f"expected a mask that is black off the material at {path}, got {got}")
     return np.asarray(mask)
 
 

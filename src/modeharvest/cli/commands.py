@@ -190,7 +190,7 @@ def _example(wanted: bool) -> None:
 
 def harvest(
     experiment: Annotated[
-        Path, typer.Argument(metavar="EXPERIMENT.toml", help="What there are photographs of.")
+        Path, typer.Argument(metavar="EXPERIMENT.toml", help="Photographs, scale and specimen.")
     ],
     out: OutFolder,
     example: Annotated[
@@ -222,8 +222,9 @@ def harvest(
     measured in full.
     """
     if watch is not None:
-        _watch(experiment, out, watch, until_still)
-        return
+        return _watch(experiment, out, watch, until_still)
+    if until_still is not None:
+        raise InputError("expected --watch FOLDER beside --until-still, got none")
     from modeharvest.report.model import print_report
     from modeharvest.report.photographs import photographs_report
     from modeharvest.runs.photographs.pipeline import harvest as harvest_photographs
@@ -238,9 +239,8 @@ def _watch(experiment: Path, out: Path, folder: Path, until_still: float | None)
     from modeharvest.runs.photographs.watch import watch
 
     print(f"watching {folder}: open {out / 'watch.html'}", flush=True)
-    test = watch(experiment, out, folder, until_still=until_still,
-                 show=lambda line: print(line, flush=True))  # fmt: skip
-    print(watch_text(test))
+    print(watch_text(watch(experiment, out, folder, until_still=until_still,
+                           show=lambda line: print(line, flush=True))))  # fmt: skip
     print(f"measure them in full by: modeharvest harvest {experiment} --out {out}")
 
 
@@ -257,7 +257,7 @@ def measure(
         float | None, typer.Option(help="Edge of a pixel in mm; without, lengths are in px.")
     ] = None,
     mesh: Annotated[
-        Path | None, typer.Option(help="Triangles, from the middle of the image, x right, y up.")
+        Path | None, typer.Option(help="Of triangles, from the image's middle, x right, y up.")
     ] = None,
     brightness: Annotated[
         int, typer.Option(help="Degree of polynomials by which gain and offset may vary: 0 to 6.")

@@ -11,7 +11,7 @@ import typer
 from modeharvest.cli.messages import bars, folder_option
 from modeharvest.util.errors import InputError
 
-Run = Annotated[Path, typer.Argument(metavar="DIR", help="Of a run that has measured, or a file.")]
+Run = Annotated[Path, typer.Argument(metavar="DIR", help="A run's folder, or a file of it.")]
 _FORMATS = (
     "ncorr, vic2d, davis, dice, matchid, gom, pyvale, csv, mat, npz; of a run hdf5, vtu, tiff"
 )
@@ -19,7 +19,7 @@ _FORMATS = (
 
 def export(
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="A run's folder, or a field of any DIC code.")
+        Path, typer.Argument(metavar="SOURCE", help="A run's folder, or any DIC code's field.")
     ],
     form: Annotated[str, typer.Option("--as", help=_FORMATS, metavar="FORMAT")],
     out: Annotated[Path, folder_option("--out", "Folder for the files.")],
@@ -73,7 +73,7 @@ def gauges(
     pages = [partial(draw_gauge, g.name, [r[g.name] for r in read.values()]) for g in wanted]
     write_pdf(out / "gauges.pdf", f"Gauges of {out.name} in {last}", rows, pages)
     print("\n".join("  ".join(row) for row in rows))
-    print(f"{len(read)} images: {out / 'gauges.csv'}, gauges.pdf")
+    print(f"{out / 'gauges.csv'}, gauges.pdf; images: {len(read)}")
 
 
 def animate(
@@ -100,4 +100,4 @@ def animate(
             on_photographs.print_fields(finished, names, out / "fields.pdf", progress)
         for name in names if form != "pdf" else ():
             on_photographs.animate(finished, name, out / f"{name}.{form}", progress)
-    print(f"{form} in {out}")
+    print(f"{out}: {', '.join(names)} as {form}")

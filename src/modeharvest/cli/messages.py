@@ -45,7 +45,7 @@ def folder_option(name: str, about: str) -> Any:
     return typer.Option(name, help=about, metavar="DIR", parser=str, callback=_folder)
 
 
-OutFolder = Annotated[Path, folder_option("--out", "Folder for everything this case leaves.")]
+OutFolder = Annotated[Path, folder_option("--out", "Folder for the results.")]
 SolutionFile = Annotated[
     Path | None,
     typer.Option(

@@ -48,9 +48,7 @@ from modeharvest.validation.whole_field import WholeFieldSummary
 Snapshot = Mapping[str, Any]
 Summary = Mapping[str, Any]
 
-_MODE = tuple(
-    zip(("a₁", "a₂", "a₃", "a₄", "a₅", "a₆", "a₇"), ("-",) * 5 + ("mm",) * 2, strict=True)
-)
+_MODE = tuple(zip([f"a{i}" for i in "₁₂₃₄₅₆₇"], ("-",) * 5 + ("mm",) * 2, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +144,8 @@ def _image(state: SnapshotState) -> Figure:
 def _residual(state: SnapshotState) -> Figure:
     map_frame = state.view.map_frame(fits.FINE)
     residual = map_frame.sample(state.comparison.residual.astype(np.float64))
-    return draw_field(map_frame, residual, ColourScale.signed(residual, "", 0.99), state.motion)
+    scale = ColourScale.signed(residual, "full scale", 0.99)
+    return draw_field(map_frame, residual, scale, state.motion)
 
 
 def _length_of(name: str) -> Callable[[SnapshotState], Figure]:

@@ -416,6 +416,7 @@
       this.tag.textContent = none ? "measured, has no truth" : this.showsTruth ? "truth" : "measured";
       const which = this.showsTruth ? "truth" : "measured";
       this.over.setAttribute("aria-label", `${this.spec.title}, ${data.states[this.state].label}, ${which}`);
+      $(".ex-unit", this.element).textContent = unit || "–";
       $(".ex-save", this.element).title = unit;
     }
 

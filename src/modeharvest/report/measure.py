@@ -114,14 +114,14 @@ def _cards(
         return draw_field(frame, field, ColourScale.signed(field, "levels", 0.95), unit=unit)
 
     def seen() -> Figure:
-        return draw_image(frame, picture(name), None, result.grid, result.displacement)
+        return draw_image(frame, picture(name), None, result.grid, result.displacement, unit=unit)
 
     u, strain = result.displacement, result.field("logarithmic")
     sd = np.linalg.norm(result.standard_deviation, axis=1)
     panels: dict[str, list[tuple[str, Callable[[], Figure]]]] = {
-        "Displacement": [(axis, partial(nodal, u[:, c], unit)) for c, axis in enumerate("uv")],
+        "Displacement": [("along " + "xy"[c], partial(nodal, u[:, c], unit)) for c in (0, 1)],
         "Logarithmic strain": [
-            (f"{'xy'[i]}{'xy'[j]}", partial(nodal, strain[:, i, j], "-"))
+            (f"{'xy'[i]}{'xy'[j]}", partial(nodal, strain[:, i, j], "strain [-]"))
             for i, j in ((0, 0), (1, 1), (0, 1))
         ],
         "Standard deviation of u, length": [("", partial(nodal, sd, unit, False))],

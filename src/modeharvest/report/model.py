@@ -60,6 +60,7 @@ class _Template(Formatter):
     def convert_field(self, value: Any, conversion: Any) -> Any:
         """A field's value as its conversion says."""
         ways: dict[str, Callable[..., str]] = {"n": number, "p": percent}
+        ways["z"] = lambda x: f"{x:#.4g}" if 1e-3 <= abs(x) < 1e3 else number(x)  # 1.530
         if conversion in ways:
             return _Readable(ways[conversion], value)
         return super().convert_field(value, conversion)

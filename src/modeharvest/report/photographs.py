@@ -156,11 +156,11 @@ def _mode_keys(frame: Frame) -> list[KeyNumber]:
 
 
 def _two_errors(mode: Mapping[str, Any]) -> str:
-    """Standard errors of the largest v [µm]."""
-    parts = [f"{_micro(mode['v_max_sd_noise_mm'])} by noise"]
-    if mode["v_max_sd_model_error_mm"] is not None:
-        parts.append(f"{_micro(mode['v_max_sd_model_error_mm'])} by model error")
-    return " ± ".join(parts)
+    """Standard errors of the largest v."""
+    parts = [f"±\u00a0{_micro(mode['v_max_sd_noise_mm'])}\u00a0µm by noise"]
+    if (sd := mode["v_max_sd_model_error_mm"]) is not None:
+        parts.append(f"±\u00a0{_micro(sd)}\u00a0µm by model error")
+    return ", ".join(parts)
 
 
 def _micro(millimetres: float | None, digits: int = 2) -> str:

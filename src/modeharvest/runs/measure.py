@@ -42,6 +42,7 @@ from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.displacement import (
     block_motion,
     brightness,
+    deformed_mask,
     displacement_from,
     misfit_of,
     residual,
@@ -392,7 +393,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         pair = self.pair(name)
         gain, offset = (part.mean() for part in brightness(pair, u, self.case.brightness))
         f, material = pair.reference, pair.masks[0]
-        noise = estimated_noise(f, material).sd * float(np.hypot(1.0, gain))
+        moved = deformed_mask(self.grid, result.mesh, result.displacement, 0.0)
+        noise_g = estimated_noise(pair.deformed, material if moved is None else moved).sd
+        noise = float(np.hypot(estimated_noise(f, material).sd, gain * noise_g))
         return numbers | {
             "cutoff_px": result.cutoff_px,
             "outside_px": result.outside,

@@ -36,6 +36,16 @@ class WriteError(InputError):
     """A file can't be written, as on a full disk: no fault of what was given, so not its result."""
 
 
+class SingularMatrixError(InputError, ArithmeticError):
+    """What was given determines no solution; the message names the library that found so."""
+
+    def __init__(self, found: str) -> None:
+        super().__init__(
+            f"expected data that determine every unknown, got a singular matrix ({found}); check "
+            "images, mask and supports"
+        )
+
+
 class MissingDependencyError(ImportError):
     """An optional library is needed for this step; the message says how to get it."""
 

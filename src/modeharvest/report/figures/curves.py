@@ -152,7 +152,6 @@ def draw_density(spectrum: Spectrum, pattern: WavePattern, component: int, end: 
     axes.imshow(both[..., component], extent=(xi1[0] - h1, xi1[-1] + h1, xi2[0] - h2, xi2[-1] + h2),
                 origin="lower", cmap=scale.colours, norm=scale.normalise, interpolation="bilinear",
                 aspect="auto", rasterized=True)  # fmt: skip
-    axes.set(xlim=(-1, 1), ylim=(-1, 1))
     faint = [] if pattern.largest is None else [(pattern.largest.xi, 0.45)]
     for xi, alpha in [(wave.xi, 1.0) for wave in pattern.waves] or faint:
         for sign in (1, -1):
@@ -189,8 +188,9 @@ def draw_convergence(result: Result) -> Figure:
         size = [step.step_px if step.step_px > 0 else np.nan for step in history[first:end]]
         axes.plot(k, size, "o-", color=colour, ms=3.5)
         axes.axvspan(k[0] - 0.5, k[-1] + 0.5, color=colour, alpha=0.08, lw=0)
-        factor = history[first].factor
-        axes.annotate("full image" if factor == 1 else f"1/{factor}", (k.mean(), 1.0), (0, 3),
+        at = history[first]
+        rows = "every 4th row" if 2 * at.pixels < result.pixels else "full image"
+        axes.annotate(rows if at.factor == 1 else f"1/{at.factor}", (k.mean(), 1.0), (0, 3),
                       xycoords=("data", "axes fraction"), textcoords="offset points", ha="center",
                       fontsize=7, color=colour, annotation_clip=False)  # fmt: skip
     if any(step.step_px > 0 for step in history):

@@ -179,18 +179,18 @@ def draw_image(
     grid: PixelGrid,
     displacement: FloatArray,
     scale: ColourScale | None = None,
+    unit: str = "mm",
 ) -> Figure:
     """Draw an image, its background left to the page.
 
     ``image``, ``material``: (rows, cols) grey levels [0 black, 1 white] and where they show
     material, None for everywhere; ``grid``: their pixels. ``displacement``: (n, 2) true
-    displacement at the mesh's nodes [mm], for the boundary. ``scale``: what the levels mean;
-    fractions of full scale by default.
+    displacement at the mesh's nodes, for the boundary. ``scale``: by default of full scale.
     """
-    drawn, axes = empty_map(map_frame)
+    drawn, axes = empty_map(map_frame, unit=unit)
     show_grey(axes, map_frame, image, material, grid)
     draw_edge(axes, map_frame.boundary.path(displacement))
-    colour_bar(axes, scale or ColourScale(style.GREY, 0.0, 1.0))
+    colour_bar(axes, scale or ColourScale(style.GREY, 0.0, 1.0, "full scale"))
     return drawn
 
 

@@ -175,8 +175,8 @@ def draw_residual(state: PhotographState) -> Figure:
     """Draw f - g(x + u) in the deformed configuration, single pixels; blank where not compared."""
     map_frame = state.view.map_frame(fits.FINE)
     values = residual_of(state, map_frame)
-    scale = ColourScale.signed(values, "" if state.harvest.full_scale else "levels", 0.99)
-    return maps.draw_field(map_frame, values, scale, state.motion)
+    unit = "full scale" if state.harvest.full_scale else "levels"
+    return maps.draw_field(map_frame, values, ColourScale.signed(values, unit, 0.99), state.motion)
 
 
 def residual_of(state: PhotographState, map_frame: maps.MapFrame) -> FloatArray:

@@ -133,9 +133,8 @@ def draw_path(axes: Axes, path: Path, **looks: Any) -> PathPatch:
 
 def scale_bar(axes: Axes, length: float, text: str) -> None:
     """Put a bar of ``length`` [data units] below the lower left corner of the axes."""
-    left = axes.get_xlim()[0]
-    bottom = axes.get_ylim()[0]
-    drop = 0.012 * abs(axes.get_ylim()[1] - bottom)
+    left, (bottom, top) = axes.get_xlim()[0], axes.get_ylim()
+    drop = 0.012 * abs(top - bottom)
     axes.plot([left, left + length], [bottom - drop] * 2, color=INK, lw=1.6, clip_on=False,
               solid_capstyle="butt")  # fmt: skip
     axes.annotate(text, (left + 0.5 * length, bottom - drop), (0, -3), textcoords="offset points",
@@ -173,8 +172,9 @@ def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
     svg = svg.replace(INK, "currentColor").replace(MUTED, "var(--muted)")
     box = re.search(r'viewBox="[^"]*"', svg)
     assert box is not None, "matplotlib's SVG has a viewBox"
-    most = f'style="max-width: {150 * width:.0f}px"'  # 150 px an inch: more is too large to read
-    head = f'<svg {box.group()} {most} role="img" aria-label="{escape(title)}">'
+    # Above 150 px an inch letters are too large; below 90, on a narrow screen, too small to read.
+    size = f'style="max-width: {150 * width:.0f}px; --least: {90 * width:.0f}px"'
+    head = f'<svg {box.group()} {size} role="img" aria-label="{escape(title)}">'
     return head + svg[svg.index(">") + 1 :]
 
 

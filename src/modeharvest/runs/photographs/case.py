@@ -129,7 +129,7 @@ class ImageScale:
         if self.line is not None and (len(self.line) != 2 or self.line[0] == self.line[1]):
             raise InputError(f"scale: expected a line of two different ends, got {self.line}")
         if not (self.mm_per_px > 0 and math.isfinite(self.mm_per_px)):
-            raise InputError(f"scale: expected a positive size, got {self.mm_per_px} mm/px")
+            raise InputError(f"scale: expected pixels above 0 mm, got {self.mm_per_px} mm/px")
 
     @property
     def mm_per_px(self) -> float:

@@ -172,7 +172,7 @@ def _all_frames(
             continue
         taken = {frame.name for frame in frames}
         for frame in numbered(named_files(base, [name], unique=False)):
-            if frame.name in taken and any(sign in name for sign in "*?[") | (base / name).is_dir():
+            if frame.name in taken:
                 skipped.append((frame.path.name, "another photograph has this name"))
                 continue
             taken.add(frame.name)
@@ -258,7 +258,7 @@ def _chosen(
     if not left:
         raise InputError(
             "images: expected photographs to measure besides the reference, got none of "
-            f"{len(frames)}; check their names, frames and between_s"
+            f"{len(frames)}; choose others"
         )
     return tuple(left)
 
