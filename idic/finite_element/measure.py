@@ -62,7 +62,7 @@ _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
 _SHORT_PX, _SHORT_AT_A_NODE_PX = 0.1, 0.5
 """After shorter steps the matrices are kept, where only the images make them change and steps get
-shorter; rms over the nodes, and of a single one [px]. On coarse levels after longer ones, too."""
+shorter; rms over the nodes, and of a single one [px]."""
 _LEAST_DET = 0.1
 """Elements that shrink to less are an iteration gone astray."""
 _UNLIKE, _SEEN = 0.25, 0.25
@@ -83,11 +83,11 @@ class _Stage:
     """Binning and blur of the images."""
     cutoff_px: float
     """Wavelength of which the regularisation leaves one half [px]."""
-    tolerance_px: float = 0.2
+    tolerance_px: float = 0.1
     """Of the step that ends it, rms over the nodes, a tenth of the longest [px]."""
 
 
-_STAGES = (_Stage(Level(2, 3.0), 200.0, 0.4), _Stage(Level(2, 1.5), 80.0, 0.4), _Stage(FULL, 40.0))
+_STAGES = (_Stage(Level(2, 3.0), 120.0, 0.4), _Stage(Level(2, 1.5), 50.0, 0.4), _Stage(FULL, 30.0))
 """Before the last one, which has the unfiltered images, too, and the cut-off that is sought."""
 _LAST_TOLERANCE_PX = 0.01
 _LONGEST_STEP_PX = 8.0
@@ -297,9 +297,7 @@ class _Measurement:
             share = np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
             rms, longest = float(np.sqrt(np.mean(length**2))), float(length.max())
-            coarse = stage.level != FULL
-            short = (np.inf, _LONGEST_STEP_PX) if coarse else (_SHORT_PX, _SHORT_AT_A_NODE_PX)
-            is_short = rms <= min(short[0], 0.5 * last) and longest <= short[1]
+            is_short = rms <= min(_SHORT_PX, 0.5 * last) and longest <= _SHORT_AT_A_NODE_PX
             if isinstance(self.prior, Imbalance) or not is_short:
                 self.kept = None
             if max(last := rms, 0.1 * longest) < stage.tolerance_px:
