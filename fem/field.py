@@ -2,7 +2,7 @@
 
 What finite elements hand to everything else. The file is HDF5, readable with h5py alone::
 
-    nodes (n, 2) [mm]    cells (m, k)    @element @geometry @material @versions @seed
+    nodes (n, 2) [mm]    cells (m, k)    @format @element @info (JSON: what was simulated)
     snapshots/0000/displacement (n, 2) [mm]    @nominal_strain @branch ...
 
 Nodes of a cell: corners counter-clockwise, then mid-sides starting between the first two corners,

@@ -142,7 +142,7 @@ def test_an_unknown_option_is_one_line(
     ("arguments", "missing"),
     [
         (("run",), "argument CASE: A shipped case ('modeharvest cases' lists them) or a TOML"),
-        (("run", "paper-virtual"), "option --out DIR: Folder for everything this case leaves."),
+        (("run", "paper-virtual"), "option --out DIR: Folder for the results."),
         (("harvest",), "argument EXPERIMENT.toml: "),
         (("measure", "a.tif", "--out", "x"), "argument DEFORMED...: Images, in the order of"),
         (("study",), "argument STUDY: robustness, noise, systematic, modes or resolution; or"),

@@ -141,13 +141,13 @@ def test_masks_without_a_lattice_are_refused() -> None:
             find_hole_lattice(mask)
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.85, 1.0, 1.2, np.sqrt(2.0)])
+@pytest.mark.parametrize("factor", [2e-4, 0.5, 0.85, 1.0, 1.2, np.sqrt(2.0)])
 def test_a_wrong_cell_size_is_contradicted(factor: float) -> None:
     holes = holes_at(lattice_points(SQUARE, (6, 10)))
     if factor == 1.0:
         lattice_of(holes, cell_px=190.0)
         return
-    words = re.escape(f"got {190.0 * factor:.1f} px ({100 * factor - 100:+.0f} %)")
+    words = re.escape(f"got {190.0 * factor:.3g} px ({100 * factor - 100:+.0f} %)")
     with pytest.raises(InputError, match=words):
         lattice_of(holes, cell_px=190.0 * factor)
 

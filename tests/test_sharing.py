@@ -123,6 +123,11 @@ def test_what_is_no_crate_is_refused(folder: Path, content: Any) -> None:
         verify(folder)
 
 
+def test_a_folder_without_a_description_is_told_who_writes_it(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="got none: 'modeharvest share' makes it"):
+        verify(tmp_path)
+
+
 def test_licences_and_folders_are_checked(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a licence"):
         write_crate(folder, licence="mine")

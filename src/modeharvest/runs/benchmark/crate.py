@@ -102,7 +102,10 @@ def verify(folder: Path | str) -> list[str]:
 
     Raises InputError if the folder has no ``ro-crate-metadata.json`` that can be read.
     """
-    folder, content = Path(folder), read_json(Path(folder) / METADATA)
+    folder, path = Path(folder), Path(folder) / METADATA
+    if not path.is_file():
+        raise InputError(f"expected {METADATA} in {folder}, got none: 'modeharvest share' makes it")
+    content = read_json(path)
     try:
         graph = {str(entity["@id"]): entity for entity in content["@graph"]}
         listed = {part["@id"]: graph[part["@id"]] for part in graph["./"]["hasPart"]}
