@@ -123,7 +123,7 @@ def test_what_is_no_crate_is_refused(folder: Path, content: Any) -> None:
         verify(folder)
 
 
-def test_a_folder_without_a_description_is_told_who_writes_it(tmp_path: Path) -> None:
+def test_a_folder_without_a_description_names_the_command_for_it(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="got none: 'modeharvest share' makes it"):
         verify(tmp_path)
 
