@@ -58,8 +58,8 @@ _DENSER = 5, 16
 _SMOOTH_PX = 60.0
 """Shorter waves of a start are what a spline makes of whole pixels, and would stay."""
 _FEW, _MANY = 1.3, 4.0
-"""Cut-off over the shortest wave of its start from which on that is too short, and waves of another
-start over it, which will do if the images don't ask for a shorter one then."""
+"""Times the shortest wave of its start from which on a cut-off asks for a smoother start, and over
+how many cut-offs that one is smoothed, unless the images ask for a shorter cut-off then."""
 _STRAY = 8.0
 """Times the spread of its neighbours' motion that a block may be off their median."""
 _FIRST = FiniteElementOptions(edge_px=4)
