@@ -41,11 +41,10 @@ class _Mumps:
 
         # The arrays are shared, so that new values need no call for each row.
         rows = (part.astype(PETSc.IntType) for part in (matrix.indptr, matrix.indices))
-        self._arrays = *rows, matrix.data.astype(PETSc.ScalarType)
-        given = matrix.shape, self._arrays
-        self._matrix = PETSc.Mat().createAIJWithArrays(*given, comm=PETSc.COMM_SELF)
+        self._arrays, alone = (*rows, matrix.data.astype(PETSc.ScalarType)), PETSc.COMM_SELF
+        self._matrix = PETSc.Mat().createAIJWithArrays(matrix.shape, self._arrays, comm=alone)
         self._matrix.setOption(PETSc.Mat.Option.SPD, definite)
-        self._pc = PETSc.PC().create(PETSc.COMM_SELF)
+        self._pc = PETSc.PC().create(alone)
         self._pc.setOperators(self._matrix)
         self._pc.setType(PETSc.PC.Type.CHOLESKY)
         self._pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
@@ -62,7 +61,8 @@ class _Mumps:
         self._matrix.stateIncrease()
         self._pc.setUp()
         if (code := self._factor.getMumpsInfog(1)) < 0:
-            raise SingularMatrixError(f"MUMPS, INFOG(1) = {code}")
+            failure = SingularMatrixError if code in (-6, -10) else ArithmeticError
+            raise failure(f"MUMPS ended with INFOG(1) = {code}")
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         from petsc4py import PETSc
