@@ -95,11 +95,13 @@ def test_full_mask_is_fine_and_black_mask_is_not(tmp_path: Path) -> None:
 
 
 def test_soft_edges_of_a_mask_count_from_half_on_and_labels_all(tmp_path: Path) -> None:
-    write_image(tmp_path / "soft.tif", np.round(255.0 * RAMP).astype(np.uint8))
-    np.testing.assert_array_equal(read_mask(tmp_path / "soft.tif"), np.round(255 * RAMP) > 127.5)
-    labels = np.digitize(RAMP, [0.3, 0.5, 0.9]).astype(np.uint8)
-    write_image(tmp_path / "labels.tif", labels)
-    np.testing.assert_array_equal(read_mask(tmp_path / "labels.tif"), labels > 0)
+    soft = np.round(255.0 * np.clip(4.0 * RAMP - 0.8, 0.0, 1.0)).astype(np.uint8)
+    write_image(tmp_path / "soft.tif", soft)
+    np.testing.assert_array_equal(read_mask(tmp_path / "soft.tif"), soft > 127.5)
+    for edges in ([0.3, 0.4], [0.3, 0.5, 0.9], np.linspace(0.3, 0.9, 60)):
+        labels = np.digitize(RAMP, edges).astype(np.uint8)
+        write_image(tmp_path / "labels.tif", labels)
+        np.testing.assert_array_equal(read_mask(tmp_path / "labels.tif"), labels > 0)
     write_image(tmp_path / "grey.tif", np.where(RAMP > 0.3, 220, 40).astype(np.uint8))
     with pytest.raises(InputError, match="no black at all, levels from 40 to 220") as error:
         read_mask(tmp_path / "grey.tif")

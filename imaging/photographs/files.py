@@ -29,7 +29,7 @@ LUMA = (0.2125, 0.7154, 0.0721)
 """Weights of red, green and blue in a grey level."""
 _TIFF = {".tif", ".tiff"}
 _LABELS = 16
-"""Levels of a mask, at most, of which each may stand for an island."""
+"""Levels of a mask with soft edges, at least, where most of it is white; others are labels."""
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it would print beside our line
 _ORIENTATION = 274
 """The tag of TIFF and of Exif."""
@@ -229,7 +229,7 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
 def read_mask(path: Path | str) -> BoolArray:
     """Read a mask (rows, cols): True where the file isn't zero, that is, where there is material.
 
-    Of a mask with soft edges, which have many levels, those above half of the largest count.
+    Of a white mask with soft edges, which have many levels, those above half of the largest count.
     InputError if the file is missing, cut short, not one plane image, zero everywhere, of several
     levels without zero, or holds NaN or infinity.
     """
@@ -238,7 +238,8 @@ def read_mask(path: Path | str) -> BoolArray:
         raise InputError(f"expected a mask of finite numbers at {path}, got NaN or infinity")
     levels = levels if levels.ndim == 2 else levels.max(axis=2)
     low, high = levels.min(), levels.max()
-    mask = levels > (0.5 * high if len(np.unique(levels)) > _LABELS else 0)
+    has_many, white = len(np.unique(levels)) > _LABELS, np.sum(levels > 0.9 * high)
+    mask = levels > (0.5 * high if has_many and 2 * white > np.sum(levels > 0) else 0)
     if not mask.any():
         raise InputError(f"expected a mask with material (above 0) at {path}, got black everywhere")
     if low > 0 and low != high:
