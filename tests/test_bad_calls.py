@@ -360,6 +360,29 @@ def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> Non
     assert "out[/bold]/report.html" in text
 
 
+def test_no_bar_is_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError), messages.bars():
+        raise InputError("before the first step")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        ("run set --out out", "expected a case file at set, found a folder"),
+        ("harvest set --out out", "'modeharvest cases photographs' prints one"),
+        ("export none --as csv --out out", "expected a folder of 'measure'"),
+    ],
+)
+def test_what_is_no_case_and_no_field_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path,
+    call: str, words: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(place)
+    assert called(monkeypatch, *call.split()) == 2
+    assert words in error_line(capsys)
+
+
 def test_a_bar_may_name_any_file(capsys: pytest.CaptureFixture[str]) -> None:
     with messages.bars() as progress:  # markup that closes nothing raises where it is drawn
         progress(0.0, 1.0, "score: [/bold].csv")

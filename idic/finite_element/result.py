@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import KDTree
 
 from modeharvest.fem.field import Mesh
@@ -27,6 +26,7 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.elements import shape_functions, shape_gradients
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import grown
 from modeharvest.util.progress import Progress, silent
 
 _BEYOND_PX = 2.0
@@ -230,9 +230,9 @@ def refitted_correlation(
 
 def _beside(mesh: Mesh, grid: PixelGrid, located: Located) -> tuple[NDArray[Any], ...]:
     """Rows, columns (k,), of pixels up to 2 px beside the mesh; nearest elements' nodes and N."""
-    distance, nearest = ndimage.distance_transform_edt(~located.mask, return_indices=True)
-    rows, cols = np.nonzero((distance > 0.0) & (distance <= _BEYOND_PX))
-    element = located.element[tuple(nearest[:, rows, cols])]
+    rows, cols = np.nonzero(grown(mask := located.mask, _BEYOND_PX) & ~mask)
+    edge = np.argwhere(mask & grown(~mask, 1.0))
+    element = located.element[*edge[KDTree(edge).query(np.column_stack([rows, cols]))[1]].T]
     xi = _local_coordinates(mesh, element, np.stack(grid.to_mm(rows, cols), axis=1))
     return rows, cols, mesh.cells[element], shape_functions(mesh.element, xi)
 

@@ -238,7 +238,6 @@ def _watch(experiment: Path, out: Path, folder: Path, until_still: float | None)
     from modeharvest.report.figures.sequence import watch_text
     from modeharvest.runs.photographs.watch import watch
 
-    print(f"watching {folder}: open {out / 'watch.html'}", flush=True)
     print(watch_text(watch(experiment, out, folder, until_still=until_still,
                            show=lambda line: print(line, flush=True))))  # fmt: skip
     print(f"measure them in full by: modeharvest harvest {experiment} --out {out}")

@@ -12,9 +12,7 @@ from modeharvest.cli.messages import bars, folder_option
 from modeharvest.util.errors import InputError
 
 Run = Annotated[Path, typer.Argument(metavar="DIR", help="A run's folder, or a file of it.")]
-_FORMATS = (
-    "ncorr, vic2d, davis, dice, matchid, gom, pyvale, csv, mat, npz; of a run hdf5, vtu, tiff"
-)
+_FORMATS = "ncorr, vic2d, davis, dice, matchid, gom, pyvale, csv, mat, npz; a run's hdf5, vtu, tiff"
 
 
 def export(
@@ -40,7 +38,9 @@ def export(
     from modeharvest.imaging.photographs.files import read_image
     from modeharvest.util.files import make_folder
 
-    if source.is_dir() or source.suffix == ".h5":
+    if source.is_dir() or source.suffix in (".h5", ""):
+        if image or pixel_size:
+            raise InputError("expected --image and --pixel-size for other codes' fields alone")
         written = FinishedRun.read(source).export(form, out, step)
     else:
         rows, cols = (1, 1) if image is None else read_image(image).shape
@@ -67,12 +67,12 @@ def gauges(
     each = ((name, finished.result(name)) for name in finished.files)
     read = write_gauges(out, wanted, each, finished.unit)
     last, rows = [*read][-1], [["gauge", "reads", "value", "standard deviation"]]
-    rows += [[name, what.replace("_", " "), f"{value:.6g} {unit}", f"± {sd:.2g}"]
+    rows += [[name, what.replace("_", " "), f"{value:.6g} {unit}".rstrip(" -"), f"± {sd:.2g}"]
              for name, found in read[last].items()
              for what, (value, sd, unit) in found.items()]  # fmt: skip
     pages = [partial(draw_gauge, g.name, [r[g.name] for r in read.values()]) for g in wanted]
     write_pdf(out / "gauges.pdf", f"Gauges of {out.name} in {last}", rows, pages)
-    print("\n".join("  ".join(row) for row in rows))
+    print("\n".join("".join(map("{:<22}".format, row)).rstrip() for row in rows))
     print(f"{out / 'gauges.csv'}, gauges.pdf; images: {len(read)}")
 
 

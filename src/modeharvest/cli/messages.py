@@ -53,10 +53,7 @@ SolutionFile = Annotated[
     ),
 ]
 
-_NOT_KEPT = (
-    "every time: neither the package's folder nor the home folder can be written to; "
-    "NUMBA_CACHE_DIR may name one that can"
-)
+_NOT_KEPT = "every time: their folder can't be written to; set NUMBA_CACHE_DIR to one that can"
 
 
 class ProgressBars(RichProgress):
@@ -72,10 +69,13 @@ class ProgressBars(RichProgress):
             console=console,
         )
         self._steps: dict[str, TaskID] = {}
+        self.disable = True  # until the first step: an empty line would be drawn
 
     def __call__(self, done: float, total: float, what: str) -> None:
         """Draw the step ``what``; a step that begins finishes the one before."""
         if what not in self._steps:
+            self.disable = False
+            self.start()
             for task in self.tasks:
                 self.update(task.id, completed=task.total)
             self._steps[what] = self.add_task(what, total=total)

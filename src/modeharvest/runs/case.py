@@ -128,7 +128,7 @@ def read_tables(name: str | Path, start: str = "NAME") -> dict[str, Any]:
     no such case or file, or it isn't TOML.
     """
     path = Path(name)
-    if path.suffix == ".toml" or path.is_file():
+    if path.suffix == ".toml" or path.is_file() or (path.is_dir() and str(path) not in _shipped()):
         with reading(path, "a case file", f"'modeharvest cases {start}' prints one"):
             return _tables(path)
     return tomllib.loads(case_text(str(name)))

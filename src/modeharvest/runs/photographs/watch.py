@@ -231,8 +231,8 @@ def watch(
 
     ``case``: a TOML file of a harvest, whose first ``deformed`` is the folder unless one is given;
     ``until_still``: the seconds without a new photograph after which it ends, None for never;
-    ``show`` gets a line of each photograph. Ends as cleanly when interrupted. Raises InputError if
-    the case, or the reference, can't be used.
+    ``show`` gets a line of the page, then of each photograph. Ends as cleanly when interrupted.
+    Raises InputError if the case, or the reference, can't be used.
     """
     from modeharvest.report.figures.sequence import write_watch_page
 
@@ -248,6 +248,7 @@ def watch(
         key = digest(["periodic modes", _COLUMNS, found.plain(), *files])
         test = WatchedTest.read(folder / "watch.json", key)
         drawn = 0.0
+        show(f"watching {where}: open {folder / 'watch.html'}")
 
         def save() -> None:
             write_json(folder / "watch.json", {"key": key, **test.summary()})
