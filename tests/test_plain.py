@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -211,18 +213,15 @@ def test_edges_beside_the_border_of_the_picture_are_contours_all_the_same() -> N
 
 
 def test_a_start_inside_out_ends_in_one_line(photographed: Path) -> None:
-    f, g, _ = cropped(photographed, "middle")
-    grid, surface, other = PixelGrid.centred(*f.shape, 0.04), plain_surface(f), plain_surface(g)
-    assert surface
+    g, grid, surface, body, anew, _ = measured_part(photographed, "middle")
+    other = plain_surface(g)
     assert other
-    body = FiniteElementOptions().body(surface.mask, grid)
     seen, start = matched_contours(surface, other, grid).seen, body.mesh.nodes * [-2.0, 0.0]
     with pytest.raises(InputError, match="contours that hold the body"):
         displacement_from_contours(seen, body, grid, start)
     # A picture before that went astray doesn't lead the next one astray.
     x, y = body.mesh.nodes.T
     folded = np.column_stack([3.0 * np.sin(4.0 * y), 3.0 * np.sin(4.0 * x)])
-    anew, _ = displacement_of_plain(surface, g, grid, body)
     found, _ = displacement_of_plain(surface, g, grid, body, before=folded)
     assert not found.warnings
     assert np.abs(found.displacement - anew.displacement).max() < 0.02 * grid.pixel_size
@@ -328,17 +327,22 @@ def cropped(photographed: Path, part: str) -> tuple[FloatImage, FloatImage, Floa
     return f, g, pair.truth.displacement[along, across]
 
 
+@cache
+def measured_part(folder: Path, part: str) -> tuple[Any, ...]:
+    """The deformed picture, its grid, the surface, the mesh, its displacement, matched contours."""
+    f, g, _ = cropped(folder, part)
+    grid, surface = PixelGrid.centred(*f.shape, PLAIN.pixel_size), plain_surface(f)
+    assert surface is not None
+    body = FiniteElementOptions().body(surface.mask, grid)
+    return g, grid, surface, body, *displacement_of_plain(surface, g, grid, body)
+
+
 @pytest.mark.parametrize("part", ["plate", "middle"])
 def test_a_part_of_a_specimen_is_measured_away_from_where_it_is_cut(
     photographed: Path, part: str
 ) -> None:
-    f, g, u = cropped(photographed, part)
-    px = PLAIN.pixel_size
-    grid = PixelGrid.centred(*f.shape, px)
-    surface = plain_surface(f)
-    assert surface is not None
-    body = FiniteElementOptions().body(surface.mask, grid)
-    result, matched = displacement_of_plain(surface, g, grid, body)
+    u, px = cropped(photographed, part)[2], PLAIN.pixel_size
+    _, _, surface, _, result, matched = measured_part(photographed, part)
     assert matched.lost == 0
     assert any(text.startswith("Not all of the specimen is in view") for text in surface.warnings)
     found, sd = result.displacement_on(), result.standard_deviation_on()
