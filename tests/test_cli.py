@@ -147,7 +147,7 @@ def test_an_unknown_option_is_one_line(
         (("measure", "a.tif", "--out", "x"), "argument DEFORMED...: Images, in the order of"),
         (("study",), "argument STUDY: robustness, noise, systematic, modes or resolution; or"),
         (("score", "a.csv", "--strain", "0.1"), "option --truth DIR: The truth's folder."),
-        (("score", "a.csv", "--truth", "x"), "option --strain: Of the image that was measured."),
+        (("score", "a.csv", "--truth", "x"), "option --strain: Nominal strain of the image."),
         *((command, "argument ") for command in COMMANDS if command[-1] not in ("star", "cases")),
         (("benchmark", "star"), "option --out DIR: Folder for the set."),
     ],

@@ -523,6 +523,6 @@ def test_states_that_are_not_those_of_the_whole_path_are_warned_of() -> None:
     none = np.zeros(0)
     assert _path_warnings(SimpleNamespace(near=near, at=same), none) == []
     (text,) = _path_warnings(SimpleNamespace(near=near, at=other), none)
-    assert "up to 0.2 mm off those of the whole path with the same parameters" in text
+    assert "up to 0.2 mm from those of the whole path with the same parameters" in text
     (text,) = _path_warnings(SimpleNamespace(near=near, at=lost), none)
-    assert text.endswith("along the whole path: expected an equilibrium, got none")
+    assert text.endswith("following the whole path failed: expected an equilibrium, got none")

@@ -131,7 +131,7 @@ def test_long_waves_are_named_by_their_direction() -> None:
 def test_waves_that_come_earlier_are_not_kept_quiet() -> None:
     point = CriticalPoint("uniaxial", 0.1, True, "critical", (made_up.M,), (0,), (1,))
     text = proof(critical(point)["critical"])
-    assert text.endswith("no other wave that was looked at is unstable before")
+    assert text.endswith("no other wave that was examined is unstable before")
     point = replace(point, earlier=((1.0, 2.0), (1.5, 2.0)))
     text = proof(critical(point)["critical"])
     assert text.endswith("but 2 other waves are unstable before")
@@ -185,4 +185,4 @@ def test_a_study_says_where_the_pattern_stops_coming_first() -> None:
     assert "from d/l = 0.69 on; at 0.67 it is long waves" in message
     assert "between 0.930 (d/l = 0.3" in message
     every = replace(made_up.study(), ratios=(made_up.row(0.7), made_up.row(0.9)), limits=())
-    assert "first for every d/l looked at, from 0.7 to 0.9" in " ".join(study_text(every))
+    assert "first for every d/l examined, from 0.7 to 0.9" in " ".join(study_text(every))

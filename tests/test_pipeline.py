@@ -221,7 +221,7 @@ def test_an_input_error_of_another_process_is_one_here(share: Share) -> None:
 
 def test_a_killed_process_is_no_fault_of_the_program() -> None:
     with (
-        pytest.raises(InputError, match="killed by signal 9, as where memory runs out"),
+        pytest.raises(InputError, match="killed by signal 9, as happens when memory runs out"),
         whole_field._children(1) as [child],
     ):
         child.kill()

@@ -105,7 +105,7 @@ def test_rows_that_no_snapshot_has_are_left_out() -> None:
 
 
 def test_what_standard_errors_mean_depends_on_the_images() -> None:
-    about = "the first takes the whole residual"
+    about = "The first treats the whole residual"
     assert "No noise was added" in note(summary(), about)
     assert "predicted noise of 0.01 of full scale" in note(summary(noise_sd=0.01), about)
     noisy = summary() | {"case": {"imaging": {"sensor": {"read_noise": 0.01, "full_well": 0.0}}}}
@@ -135,4 +135,4 @@ class Warm(Sensor):
 def test_the_report_knows_noise_of_any_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(experiment, "Sensor", Warm)
     noisy = summary() | {"case": {"imaging": {"sensor": {"dark_variance": 1e-4}}}}
-    assert "noise-free averages" in note(noisy, "the first takes the whole residual")
+    assert "noise-free averages" in note(noisy, "The first treats the whole residual")

@@ -114,7 +114,7 @@ def test_numbers_of_a_robustness_study() -> None:
     assert numbers["largest_distance_px"] == 2.0
     assert numbers["other_minimum_called_converged"] == 1
     assert found.text[0].startswith("97 of 100 initial guesses")
-    assert any("1 failed, and count as not converged" in s for s in found.text)
+    assert any("failed: 1. They count as not converged" in s for s in found.text)
     # Its epsilon is 0.5 %.
     assert any("does not detect 1 of the 2 results in other" in s for s in found.text)
     assert any("2 in other minima, 1 are called converged" in s for s in found.text)

@@ -32,13 +32,13 @@ INDEPENDENT = "independent calculation"
 
 @dataclass(frozen=True)
 class Expectation:
-    """What was obtained against what is expected, in ``unit`` or in words, and its source."""
+    """A result and its expected value, in ``unit`` or as text, and the source of the latter."""
 
     quantity: str
     obtained: float | str | None
     expected: float | str
-    ok: bool
-    """Whether the first is as good as the second asks for."""
+    ok: bool | None
+    """Whether the result meets the expectation; None where nothing was expected of it."""
     unit: str = ""
     source: str = ""
 
@@ -46,13 +46,13 @@ class Expectation:
     def at_most(
         cls, quantity: str, obtained: float, limit: float, unit: str, source: str = PROMISE
     ) -> Expectation:
-        """A number that must not be above a limit."""
+        """Expect a number to be at most ``limit``."""
         return cls(quantity, obtained, f"≤ {limit:g}", obtained <= limit, unit, source)
 
 
 @dataclass(frozen=True)
 class BuckledEnergy:
-    """Stored energy of a buckled snapshot and of the unstable path at its strain [N]."""
+    """Stored energy per thickness of a buckled snapshot and of the unstable path there [N]."""
 
     nominal_strain: float
     branch_N: float
@@ -61,7 +61,7 @@ class BuckledEnergy:
 
 @dataclass(frozen=True)
 class ModeSummary:
-    """A mode's parameters, of all equivalents the ones nearest to the ideal ones."""
+    """A mode's parameters: of all equivalent sets the one nearest to the ideal parameters."""
 
     name: str
     names: tuple[str, ...]
@@ -71,7 +71,7 @@ class ModeSummary:
     """The exact pattern with its origin on a solid junction."""
     standard_error: tuple[float | None, ...]
     model_error: tuple[float | None, ...]
-    """Standard errors of ``found``, by noise and by model error; the latter empty where the mode is
+    """Standard errors of ``found``, by noise and by model error; the latter is empty if the mode is
     not observable."""
     best_fit: tuple[float, ...]
     amplitude_px: float
@@ -81,19 +81,19 @@ class ModeSummary:
 
 _SINGLE = {"mode": "found", "mode_ideal": "ideal", "mode_standard_error": "standard_error",
            "mode_model_error": "model_error", "mode_best_fit": "best_fit"}  # fmt: skip
-"""What ``summary.json`` calls the parameters of a single mode."""
+"""Keys in ``summary.json`` for the parameters of a single mode."""
 _OPTIONAL = {"gain_min", "gain_max", "offset_min", "offset_max", "mode_deviation_percent", "modes",
              "whole_field"}  # fmt: skip
-"""What it leaves out where it was not measured."""
+"""Keys that ``summary.json`` omits if they were not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotSummary:
-    """One strain of a virtual experiment; rms is per component.
+    """One strain of a virtual experiment; rms values are per component.
 
-    Lengths of ``pattern_...`` are of v1 phi1, or of the sum over all ``modes``, which are empty
-    without free parameters. Without gain and offset as unknowns these are None, and so is what
-    belongs to noise for noise-free images.
+    The lengths ``pattern_...`` are those of v1 phi1, or of the sum over all modes. ``modes`` is
+    empty without free parameters. Gain and offset are None if they are not unknowns; numbers about
+    noise are None for noise-free images.
     """
 
     nominal_strain: float
@@ -112,7 +112,7 @@ class SnapshotSummary:
     condition_number: float = quantity("condition number", "–")
     residual_correlation: float = quantity("autocorrelation of the residual, 4 to 12 px", "–")
     noise_sd: float | None = quantity("noise of the camera images, rms, share of full scale", "–")
-    """Rms over the material and both images."""
+    """Rms over the material in both images."""
     chi_square: float | None = quantity("χ² of the residual: 1 if that noise and no more", "–")
     gain_min: float | None = quantity("gain between the images, smallest", "–", default=None)
     gain_max: float | None = quantity("… largest", "–", default=None)
@@ -124,7 +124,7 @@ class SnapshotSummary:
     outcome_why: str
     modes: tuple[ModeSummary, ...] = ()
     mode_deviation_percent: tuple[float, ...] = ()
-    """Of a single mode, Eq. (mode), from the ideal one; staggered rows have several modes."""
+    """Deviation of a single mode, Eq. (mode), from the ideal one; empty with several modes."""
     mode_observable: bool
     worst_determined: tuple[str, ...]
     undetermined: tuple[str, ...]
@@ -137,7 +137,7 @@ class SnapshotSummary:
     whole_field: WholeFieldSummary | None = None
 
     def plain(self) -> dict[str, Any]:
-        """As plain values, a single mode's parameters among them; without what is empty."""
+        """As plain values, including the parameters of a single mode; empty values are omitted."""
         values: dict[str, Any] = to_plain(self)
         if self.mode_deviation_percent:
             (mode,) = values.pop("modes")
@@ -147,22 +147,22 @@ class SnapshotSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentSummary:
-    """What was run, how it buckles, how far each snapshot's measurement is from the truth.
+    """The case, its buckling, and the errors of each snapshot's measurement.
 
-    Seconds are in ``timings.json``, so that two runs leave the same summary.
+    Run times are in ``timings.json``, so that two runs give the same summary.
     """
 
     title: str
     case: Mapping[str, Any]
     critical_strain: float | None
     critical: Mapping[str, Any] | None
-    """How the critical point was found and proven."""
+    """How the critical point was found and verified."""
     energy_below_unstable: tuple[BuckledEnergy, ...]
     snapshots: tuple[SnapshotSummary, ...]
     inverse_map_max_residual_px: float
     factorisations: int | None
     simulation_outcome: str | None
-    """How far the simulation got."""
+    """How far the simulation followed the path."""
     warnings: tuple[str, ...]
     versions: Mapping[str, str]
     expected: tuple[Expectation, ...] = ()
@@ -173,9 +173,9 @@ class ExperimentSummary:
 
 
 def expectations(summary: ExperimentSummary) -> tuple[Expectation, ...]:
-    """Compare a summary of the paper's specimen with what is expected of it.
+    """Compare a summary of the paper's specimen with the expected values.
 
-    Snapshots that are not there, and a critical strain that was not found, are left out.
+    Missing snapshots, and a critical strain that was not found, are omitted.
     """
     residual, critical = summary.inverse_map_max_residual_px, summary.critical_strain
     rows = []
@@ -223,25 +223,25 @@ def _of_buckled(snapshot: SnapshotSummary, at: str) -> list[Expectation]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredExperiment:
-    """What is to be assessed."""
+    """A virtual experiment with its images and measurements, to be assessed."""
 
     experiment: Experiment
     options: SquareLatticeOptions
     solution: Solution
     images: ImageSet
     results: Mapping[float, Result]
-    """By nominal strain."""
+    """Results by nominal strain."""
 
     @property
     def specimen(self) -> Specimen:
-        """The geometry."""
+        """The geometry of the specimen."""
         return self.experiment.specimen
 
 
 def experiment_summary(
     measured: MeasuredExperiment, case: Mapping[str, Any], snapshots: Sequence[SnapshotSummary]
 ) -> ExperimentSummary:
-    """All numbers of an experiment, from those of its snapshots."""
+    """All numbers of an experiment, from the summaries of its snapshots."""
     info, images = measured.solution.info, measured.images
     critical = info.get("critical")
     summary = ExperimentSummary(
@@ -253,7 +253,7 @@ def experiment_summary(
         warnings=tuple(info.get("warnings", [])),
         versions={**info.get("versions", {}), **images.info.get("versions", {})},
     )  # fmt: skip
-    # What is expected is known for the paper's experiment at its resolution, and no other.
+    # Expected values are known only for the paper's experiment at its resolution.
     is_known = measured.experiment == Experiment() and images.spec.pixel_size == 0.01
     return replace(summary, expected=expectations(summary)) if is_known else summary
 
@@ -268,7 +268,7 @@ def displacement_spectrum(
 
 
 def compare_snapshot(k: int, measured: MeasuredExperiment) -> Comparison:
-    """Set the k-th result, by ascending strain, against the truth."""
+    """Compare the k-th result, by ascending strain, with the truth."""
     strain = sorted(measured.results)[k]
     result, options = measured.results[strain], measured.options
     start = result.ansatz.initial_guess(strain, options.start_amplitude)
@@ -315,7 +315,7 @@ def snapshot_summary(
 def _snapshot_noise(measured: MeasuredExperiment, strain: float) -> ImageNoise | None:
     """Noise of the exposures [fraction of full scale]; None if noise-free images were measured.
 
-    The roots of mean variances, since chi squared compares sums of squares.
+    Each is the root of the mean variance, since chi squared compares sums of squares.
     """
     if not measured.options.camera:
         return None
@@ -326,7 +326,7 @@ def _snapshot_noise(measured: MeasuredExperiment, strain: float) -> ImageNoise |
 
 
 def _brightness(comparison: Comparison) -> dict[str, Any]:
-    """Gain [-] and offset [fraction of full scale] over the material; nothing if not unknown."""
+    """Ranges of gain [-] and offset [of full scale] over the material; empty if not unknowns."""
     grid, ansatz = comparison.grid, comparison.result.ansatz
     degrees = ansatz.brightness.gain_degree, ansatz.brightness.offset_degree
     fields = ansatz.gain_and_offset(comparison.result.unknowns, grid.x, grid.y)
@@ -342,7 +342,7 @@ def _brightness(comparison: Comparison) -> dict[str, Any]:
 def _mode_numbers(
     comparison: Comparison, measured: MeasuredExperiment, found: Identifiability
 ) -> dict[str, Any]:
-    """The modes' parameters against the ideal ones; nothing where they were fixed."""
+    """The modes' parameters and the ideal ones; empty if the parameters were fixed."""
     result, best, pitch = comparison.result, comparison.best, measured.specimen.pitch
     ansatz = result.ansatz
     start = ansatz.initial_guess(comparison.strain, measured.options.start_amplitude)
@@ -374,7 +374,7 @@ def _mode_numbers(
 
 
 def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> tuple[float | None, ...]:
-    """Standard deviations of the unknowns by model error, a unit cell a draw; None if unknown."""
+    """Standard deviations of the unknowns by model error, clustered by cell; None if unknown."""
     options, result = measured.options, comparison.result
     pair = measured.images.pair(comparison.strain, camera=options.camera)
     try:
@@ -386,7 +386,7 @@ def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> tuple
 
 
 def _energies(solution: Solution) -> tuple[BuckledEnergy, ...]:
-    """Of the buckled snapshots."""
+    """Energies of the buckled snapshots and of the unstable path."""
     primary = solution.info.get("path", {}).get("primary", {})
     at = dict(zip(primary.get("nominal_strain", []), primary.get("energy_N", []), strict=True))
     return tuple(

@@ -20,18 +20,18 @@ from modeharvest.cli.messages import (
 from modeharvest.util.errors import InputError
 
 CodeNames = Annotated[
-    list[str] | None, typer.Option("--name", help="Of the code; once for each FIELD.")
+    list[str] | None, typer.Option("--name", help="Name of the code; once for each FIELD.")
 ]
 YAxes = Annotated[
     list[str] | None,
-    typer.Option("--y-axis", help="Where y grows and v is positive: down, up or 'file'."),
+    typer.Option("--y-axis", help="Direction of positive y and v: down, up or 'file'."),
 ]
 FirstPixels = Annotated[
     list[int] | None, typer.Option("--first-pixel", help="Number of the first pixel: 0 or 1.")
 ]
 Columns = Annotated[
     list[str] | None,
-    typer.Option("--column", help="u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
+    typer.Option("--column", help="As u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
 ]
 
 
@@ -65,7 +65,7 @@ def score(
         typer.Argument(metavar="FIELD...", help="CSV, NPZ, HDF5, MAT or VTK files of any code."),
     ],
     truth: Annotated[Path, typer.Option("--truth", help="The truth's folder.", metavar="DIR")],
-    strain: Annotated[float, typer.Option("--strain", help="Of the image that was measured.")],
+    strain: Annotated[float, typer.Option("--strain", help="Nominal strain of the image.")],
     out: OutFolder,
     name: CodeNames = None,
     unit: Annotated[
@@ -78,7 +78,7 @@ def score(
 ) -> None:
     """Grade displacement fields of any DIC code against the truth of a benchmark, and rank them.
 
-    --unit, --y-axis and --first-pixel count for all fields, or are given once for each, in order.
+    --unit, --y-axis and --first-pixel apply to all fields, or are given once for each, in order.
     Leaves report.html, scores.json and scores.csv in DIR. Fields that can't be graded are named at
     the end, and the exit code is then 2.
     """
@@ -107,17 +107,17 @@ def star(
     out: Annotated[Path, folder_option("--out", "Folder for the set.")],
     noise: Annotated[
         list[float] | None,
-        typer.Option("--noise", help="Share of full scale [0.01]; once for each level."),
+        typer.Option("--noise", help="Sd, share of full scale [0.01]; once for each level."),
     ] = None,
-    bits: Annotated[int, typer.Option("--bits", help="Of the noisy images.")] = 8,
-    seed: Annotated[int, typer.Option("--seed", help="Of speckle and noise.")] = 0,
-    rows: Annotated[int, typer.Option("--rows", help="Of the images, odd.")] = 501,
-    cols: Annotated[int, typer.Option("--cols", help="Of the images.")] = 4000,
+    bits: Annotated[int, typer.Option("--bits", help="Bits of the noisy images.")] = 8,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of speckle and noise.")] = 0,
+    rows: Annotated[int, typer.Option("--rows", help="Rows of the images, odd.")] = 501,
+    cols: Annotated[int, typer.Option("--cols", help="Columns of the images.")] = 4000,
 ) -> None:
     """Make the star images of DIC Challenge 2.0: a wave whose period grows along the image.
 
-    Exact ones, and for each level of noise three as a camera's: before, the same without motion,
-    after. Its displacement is a formula, in README.md and star.json beside them.
+    Writes exact images, and for each level of noise three as a camera's: reference, a second one
+    without motion, deformed. The displacement is a formula, in README.md and star.json.
     """
     from modeharvest.validation.scoring.star import Star, StarSpec, fine_speckle, make_star_set
 
@@ -148,8 +148,8 @@ def resolution(
 ) -> None:
     """Grade fields measured on the star: finest period, noise floor, metrological efficiency.
 
-    All in px. --y-axis and --first-pixel count for all fields, or are given once for each FIELD;
-    its --still has the same. Leaves report.html, resolution.json and resolution.csv in DIR.
+    Fields are in px. --y-axis and --first-pixel apply to all, or are given once for each FIELD
+    and its --still. Leaves report.html, resolution.json and resolution.csv in DIR.
     """
     from modeharvest.report.grades import star_report
     from modeharvest.report.model import print_report

@@ -40,7 +40,7 @@ def cases(
 
 WholeField = Annotated[
     bool | None,
-    typer.Option(help="Measure the whole displacement, up to every edge, on a mesh, or don't."),
+    typer.Option(help="Measure the whole displacement on a mesh, up to every edge, or don't."),
 ]
 
 
@@ -51,7 +51,7 @@ def run(
 
     Leaves solution, images with truth, results, report.html and summary.json in DIR. Run the
     same command again after an interruption: finished stages are not repeated. The twin of a real
-    experiment is photographed, harvested from its photographs alone, and set against its truth.
+    experiment is photographed, measured from its photographs alone, and compared with its truth.
     """
     from modeharvest.report.experiment import experiment_report
     from modeharvest.report.model import print_report
@@ -102,7 +102,7 @@ def image(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None
 
 
 def correlate(case: CaseName, out: OutFolder, whole_field: WholeField = None) -> None:
-    """Measure the images by micromorphic IDIC: DIR/correlation, and DIR/whole_field if asked to."""
+    """Measure the images by micromorphic IDIC: DIR/correlation (and DIR/whole_field)."""
     with _stages(case, out, whole_field=whole_field) as stages:
         stages.correlate()
         wholes = stages.measure()
@@ -111,7 +111,7 @@ def correlate(case: CaseName, out: OutFolder, whole_field: WholeField = None) ->
         print(f"{100 * strain:6.2f} %  {result.outcome.name.lower()}: {result.outcome.value}")
     for strain, whole in wholes.items():
         at = f"{100 * strain:6.2f} %  whole displacement"
-        print(f"{at}: {whole.unknowns} unknowns, cut-off {whole.cutoff_px:.3g} px")
+        print(f"{at}: {whole.unknowns} unknowns, cut-off wavelength {whole.cutoff_px:.3g} px")
 
 
 def validate(
@@ -144,7 +144,7 @@ def _stages(
 
 
 def bloch(case: CaseName, out: OutFolder) -> None:
-    """Analyse an infinite lattice: what makes it buckle first, of all waves (needs dolfinx).
+    """Find the first instability of an infinite lattice, over all waves (needs dolfinx).
 
     Square, hexagonal or chiral, or with kind = "file" a mesh or geometry of your own (see
     docs/how-to/own_cell.md). Leaves the first critical load and waves with their proof, eigenvalues
@@ -156,8 +156,8 @@ def bloch(case: CaseName, out: OutFolder) -> None:
 def modes(case: CaseName, out: OutFolder) -> None:
     """Find an infinite lattice's modes, buckled branches and mode families (needs dolfinx).
 
-    Does what 'bloch' does, unless that is there already, and goes on: real modes on the smallest
-    cell, branches with their energies, spectra, and the Fourier mode families found in them.
+    Does what 'bloch' does, unless its results exist, and then finds real modes on the smallest
+    cell, branches with their energies, spectra, and the Fourier mode families in the spectra.
     """
     _analyse(case, out, whole=True)
 
@@ -199,15 +199,15 @@ def harvest(
     whole_field: WholeField = None,
     contours: Annotated[
         bool | None,
-        typer.Option(help="Measure modes by the material's edges, too, beside speckle, or don't."),
+        typer.Option(help="Measure modes by the material's contours, too, not only by speckle."),
     ] = None,
     watch: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Follow a running test: its photographs come here."),
+        typer.Option(metavar="FOLDER", help="Follow a running test: where its photographs arrive."),
     ] = None,
     until_still: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="Stop watching when none has come for so long."),
+        typer.Option(metavar="SECONDS", help="Stop watching when no photograph came for so long."),
     ] = None,
 ) -> None:
     """Harvest modes from photographs of a test: v0, v1 and phi1 with error bars.
@@ -218,8 +218,8 @@ def harvest(
     again after an interruption: finished photographs are not measured again.
 
     With --watch, photographs are measured quickly as they come, and DIR/watch.html predicts when
-    the specimen will buckle; it ends with Ctrl-C, or --until-still. Without it, then, all are
-    measured in full.
+    the specimen will buckle; it ends with Ctrl-C, or by --until-still. Run the command again
+    without --watch to measure all photographs in full.
     """
     if watch is not None:
         return _watch(experiment, out, watch, until_still)
@@ -248,7 +248,7 @@ def measure(
     deformed: Annotated[
         list[str], typer.Argument(metavar="DEFORMED...", help="Images, in the order of the test.")
     ],
-    out: Annotated[Path, folder_option("--out", "Folder for everything the measurement leaves.")],
+    out: Annotated[Path, folder_option("--out", "Folder for all results.")],
     mask: Annotated[
         Path | None, typer.Option(help="Image, black off the material; by default it is found.")
     ] = None,
@@ -256,25 +256,25 @@ def measure(
         float | None, typer.Option(help="Edge of a pixel in mm; without, lengths are in px.")
     ] = None,
     mesh: Annotated[
-        Path | None, typer.Option(help="Of triangles, from the image's middle, x right, y up.")
+        Path | None, typer.Option(help="Mesh of triangles; origin: image's middle, x right, y up.")
     ] = None,
     brightness: Annotated[
-        int, typer.Option(help="Degree of polynomials by which gain and offset may vary: 0 to 6.")
+        int, typer.Option(help="Degree of the polynomials of gain and offset over x, y: 0 to 6.")
     ] = 0,
-    every: Annotated[int, typer.Option(help="Only every so many of the images.")] = 1,
+    every: Annotated[int, typer.Option(help="Measure only every N-th image.", metavar="N")] = 1,
     log: Annotated[
-        Path | None, typer.Option(help="What the testing machine wrote down, joined by time.")
+        Path | None, typer.Option(help="Log file of the testing machine, joined to images by time.")
     ] = None,
     gauges: Annotated[
         Path | None,
-        typer.Option(metavar="GAUGES.toml", help="Points, lines and areas that the report reads."),
+        typer.Option(metavar="GAUGES.toml", help="Points, lines and areas to read in the fields."),
     ] = None,
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
-    TIFF, PNG or JPEG of one size, folders, videos; of a plain specimen, all of it in the images,
-    contours. Leaves displacement, standard deviations, strains (HDF5, VTU, CSV, TIFF maps),
-    report.html and summary.json in DIR. Run it again after an interruption: it continues.
+    TIFF, PNG or JPEG of one size, folders, videos; specimens without speckle, if they are in the
+    images as a whole, by contours. Leaves displacement, standard deviations, strains (HDF5, VTU,
+    CSV, TIFF), report.html, summary.json in DIR. Run again after an interruption: it continues.
 
     For example: modeharvest measure ref.tif def_*.tif --mask mask.png --out out/plate
     """
@@ -301,23 +301,23 @@ def study(
             help="robustness, noise, systematic, modes or resolution; or a TOML file of your own.",
         ),
     ],
-    out: Annotated[Path, folder_option("--out", "Folder for everything the study leaves.")],
+    out: Annotated[Path, folder_option("--out", "Folder for all results.")],
     workers: Annotated[
         int | None, typer.Option(help="Processes on this machine; 2 by default.", metavar="N")
     ] = None,
     memory: Annotated[
-        str, typer.Option(help="Most that each of them may take.", metavar="BYTES")
+        str, typer.Option(help="Memory that each process may take at most.", metavar="BYTES")
     ] = "4GiB",
     scheduler: Annotated[
         str | None,
-        typer.Option(help="A dask scheduler instead, e.g. tcp://host:8786.", metavar="ADDRESS"),
+        typer.Option(help="A dask scheduler instead, as tcp://host:8786.", metavar="ADDRESS"),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer cases, larger pixels: a first look.")
     ] = False,
     solution: SolutionFile = None,
 ) -> None:
-    """Study how good the measurement is: many cases, run by several processes.
+    """Study the accuracy of the measurement: many cases, run by several processes.
 
     Leaves table.csv, report.html and summary.json in DIR. Run the same command again after an
     interruption: finished cases are not repeated.

@@ -17,19 +17,19 @@ PIXEL_SIZE = 0.02
 ABOUT = (
     "A virtual laboratory for integrated digital image correlation (IDIC) on mechanical "
     "metamaterials: buckle a cellular elastomer, make speckle images whose truth is known at "
-    "every pixel, measure them, and see its errors and where they come from.\n\n"
+    "every pixel, measure them, and see the errors of the measurement and their causes.\n\n"
     "Start with: [bold]modeharvest demo[/bold], then [bold]modeharvest run paper-virtual --out "
     "out/demo[/bold], or [bold]modeharvest harvest --example[/bold] for your own photographs"
 )
 EXIT_CODES = (
     "Exit codes: 0 done, 2 the input can't be used (one line says why), 70 a fault in the "
-    "program (one line names a log), 130 interrupted."
+    "program (one line names a log file), 130 interrupted."
 )
 FIRST = """\
 modeharvest {version}: integrated digital image correlation on mechanical metamaterials
 
   modeharvest demo                 begin here: measure a buckled specimen, and see the errors
-  modeharvest doctor               what is there, what is missing, what each command needs
+  modeharvest doctor               check the installation, and what each command needs
 
 Then, with your own:
 
@@ -48,14 +48,14 @@ Next:
 
 
 def demo(
-    out: Annotated[Path, folder_option("--out", "Folder for what the demo leaves.")] = Path(
+    out: Annotated[Path, folder_option("--out", "Folder for the demo's results.")] = Path(
         "modeharvest-demo"
     ),
 ) -> None:
     """Image and measure a buckled specimen, and see the errors: no finite elements needed.
 
     Takes the solution of the paper's specimen that comes with the package, and larger pixels than
-    the paper; leaves report.html in DIR. The first time kernels are compiled and kept.
+    the paper; leaves report.html in DIR. The first run compiles kernels, which are kept on disk.
     """
     from modeharvest.runs.case import Case, shipped_solution
     from modeharvest.runs.experiment import Run

@@ -6,12 +6,12 @@ from modeharvest.cli.messages import CaseName, OutFolder, SolutionFile, bars
 
 
 def design(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
-    """Say how well a test will measure v1, wave numbers and phases, before it is made.
+    """Predict how well a test will measure v1, wave numbers and phases, before it is made.
 
-    From the Cramér–Rao bound, without an image: standard deviations by the camera's noise; which
+    By the Cramér–Rao bound, without an image: standard deviations by the camera's noise; which
     pixel size, speckle, noise, exposures and light a wanted error needs; how degrees and strains
-    change it. Leaves report.html with tables and a map, and summary.json. CASE is that
-    of a virtual experiment; its table design says what is wanted (docs/how-to/design.md).
+    change it. Leaves report.html with tables and a map, and summary.json. CASE is a virtual
+    experiment; its table "design" states the wanted errors (docs/how-to/design.md).
     """
     from modeharvest.report.design import design_report
     from modeharvest.report.model import print_report

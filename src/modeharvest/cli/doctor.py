@@ -13,8 +13,7 @@ from pathlib import Path
 FEM = ("fenics-dolfinx", "petsc4py", "gmsh")
 OPTIONAL = {
     "fenics-dolfinx": "finite elements: conda, or apt install python3-dolfinx",
-    "petsc4py": "the same",
-    "slepc4py": "eigenvalues of infinite lattices: conda, or apt install python3-slepc4py",
+    "petsc4py": "comes with fenics-dolfinx",
     "gmsh": "meshes: pip install gmsh; beside dolfinx: conda, or apt install python3-gmsh",
     "imageio-ffmpeg": "videos: pip install imageio-ffmpeg",
 }
@@ -22,18 +21,18 @@ OPTIONAL = {
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "demo": (), "doctor": (), "cases": (), "image": (), "correlate": (), "validate": (),
     "share": (), "harvest": (), "design": (), "study": (), "score": (), "benchmark": (), "run": (),
-    "measure": ("gmsh",), "fem": FEM, "bloch": (*FEM, "slepc4py"), "modes": (*FEM, "slepc4py"),
+    "measure": ("gmsh",), "fem": FEM, "bloch": FEM, "modes": FEM,
     "homogenize": FEM, "identify": FEM, "gauges": (), "animate": (), "export": (),
 }  # fmt: skip
 """What each command needs beyond the package's own dependencies."""
 REMARKS = {
-    "run": "of a specimen without a solution: fenics-dolfinx; with --whole-field: gmsh",
-    "harvest": "with --whole-field: gmsh; of videos: imageio-ffmpeg",
-    "design": "of other specimens than those shipped: fenics-dolfinx",
-    "animate": "as MP4: imageio-ffmpeg",
-    "measure": "gmsh is not needed with --mesh; of videos: imageio-ffmpeg",
-    "study": "of specimens without a solution: fenics-dolfinx",
-    "benchmark": "of specimens without a solution: fenics-dolfinx",
+    "run": "for a specimen without a solution: fenics-dolfinx; with --whole-field: gmsh",
+    "harvest": "with --whole-field: gmsh; for videos: imageio-ffmpeg",
+    "design": "for other specimens than those shipped: fenics-dolfinx",
+    "animate": "for MP4: imageio-ffmpeg",
+    "measure": "gmsh is not needed with --mesh; for videos: imageio-ffmpeg",
+    "study": "for specimens without a solution: fenics-dolfinx",
+    "benchmark": "for specimens without a solution: fenics-dolfinx",
 }
 Row = tuple[str, str, str]
 
@@ -117,7 +116,7 @@ def caches() -> Iterator[Row]:
 
 
 def doctor() -> None:
-    """Say what is there, what is missing, what each command needs, and where caches lie."""
+    """Check the installation: libraries, what each command needs, where caches are."""
     found = examine()
     for title, rows in (("This machine", found.machine), ("Libraries", found.libraries),
                         ("Commands", found.commands), ("Caches", found.caches)):  # fmt: skip

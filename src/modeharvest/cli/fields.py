@@ -21,15 +21,15 @@ def export(
     ],
     form: Annotated[str, typer.Option("--as", help=_FORMATS, metavar="FORMAT")],
     out: Annotated[Path, folder_option("--out", "Folder for the files.")],
-    step: Annotated[int, typer.Option(help="Pixels between points of codes.", min=1)] = 5,
+    step: Annotated[int, typer.Option(help="Point spacing of codes' files, px.", min=1)] = 5,
     image: Annotated[
-        Path | None, typer.Option(help="The reference, for another code's field in pixels.")
+        Path | None, typer.Option(help="Reference image, for another code's field in pixels.")
     ] = None,
-    pixel_size: Annotated[float | None, typer.Option(help="Of that image, in mm.")] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="Pixel size of that image, mm.")] = None,
 ) -> None:
-    """Write measured displacements as another DIC code would, or with all fields that follow.
+    """Write measured displacements in another DIC code's format, or with all derived fields.
 
-    Other codes' fields are recognised and converted; what they were read as is said.
+    Other codes' fields are recognised and converted; how they were read is printed.
     """
     from modeharvest.idic.local.export import export_field
     from modeharvest.idic.local.field import read_field
@@ -84,7 +84,7 @@ def animate(
     ] = None,
     form: Annotated[str, typer.Option("--as", help="gif, mp4, or pdf of all fields.")] = "gif",
     photograph: Annotated[
-        list[Path] | None, typer.Option(help="Of each image in turn, where they were moved.")
+        list[Path] | None, typer.Option(help="Photograph of each image, in order, if moved.")
     ] = None,
 ) -> None:
     """Draw fields on the deformed photographs of a run: DIR/FIELD.gif, FIELD.mp4, fields.pdf."""

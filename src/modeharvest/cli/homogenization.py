@@ -9,8 +9,8 @@ def homogenize(case: CaseName, out: OutFolder) -> None:
     """Homogenize a specimen with modes, measured or computed (needs dolfinx).
 
     Micromorphic homogenization: finite elements of u and the modes' amplitudes v, with an RVE at
-    each of their points. Leaves the critical strain, forces and energies with the standard
-    deviations that a measured mode's error bars make, beside a direct simulation of all holes:
+    each quadrature point. Leaves the critical strain, forces and energies with the standard
+    deviations due to a measured mode's error bars, beside a direct simulation of all holes:
     report.html, summary.json, homogenized.h5; and the RVE with its modes and moduli for other
     codes: rve.h5, rve.mat. The mode of 'paper-homogenized' is measured in the images of the
     paper's virtual experiment, which is run in DIR/experiment.

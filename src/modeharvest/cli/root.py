@@ -35,7 +35,7 @@ app = typer.Typer(
     add_completion=False,
 )
 benchmark_app = typer.Typer(
-    help="Image sets for any DIC code, whose truth is kept apart.", no_args_is_help=True
+    help="Make image sets for any DIC code, grade what it measures.", no_args_is_help=True
 )
 
 _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
@@ -43,11 +43,11 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
         commands.run, commands.fem, commands.image, commands.correlate, commands.validate,
     ),
     "An infinite lattice": (commands.bloch, commands.modes),
-    "Modes in use": (homogenization.homogenize,),
+    "Homogenization with modes": (homogenization.homogenize,),
     "Photographs of a test": (commands.harvest, commands.measure, identification.identify),
-    "What was measured": (gauges, animate, export),
-    "How good a measurement is": (design.design, commands.study, benchmark.score),
-    "To begin with, and to share": (demo, doctor, commands.cases, share),
+    "Measured fields": (gauges, animate, export),
+    "Accuracy of a measurement": (design.design, commands.study, benchmark.score),
+    "Getting started, and sharing": (demo, doctor, commands.cases, share),
 }  # fmt: skip
 
 
@@ -80,7 +80,7 @@ for family, members in _FAMILIES.items():
         app.command(cls=_Command, help=_help(command), rich_help_panel=family)(command)
 for command in (benchmark.make, benchmark.star, benchmark.resolution, *COMMANDS):
     benchmark_app.command(cls=_Command, help=_help(command))(command)
-app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
+app.add_typer(benchmark_app, name="benchmark", rich_help_panel="Accuracy of a measurement")
 
 
 def _version(wanted: bool) -> None:
@@ -93,7 +93,7 @@ def _version(wanted: bool) -> None:
 def _common(
     context: typer.Context,
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     if context.invoked_subcommand is None:

@@ -9,7 +9,7 @@ import typer
 
 from modeharvest.cli.messages import UNUSABLE, OutFolder, bars, folder_option
 
-Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a finished run or a set.")]
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of a finished run or set.")]
 
 
 def share(
@@ -20,7 +20,7 @@ def share(
     author: Annotated[
         str, typer.Option("--author", help="'Name <https://orcid.org/...>' of who made it.")
     ] = "",
-    title: Annotated[str, typer.Option("--title", help="By default the run's own.")] = "",
+    title: Annotated[str, typer.Option("--title", help="Title; by default the run's.")] = "",
 ) -> None:
     """Describe a finished folder for an archive: RO-Crate with licence, checksums, software, units.
 
@@ -34,7 +34,7 @@ def share(
 
 
 def verify(folder: Folder) -> None:
-    """Check a shared folder: every file there, unchanged, listed; a set's id that of its images."""
+    """Check a shared folder: all files listed and unchanged, a set's id that of its images."""
     from modeharvest.runs.benchmark.crate import verify as faults_of
 
     faults = faults_of(folder)
@@ -54,7 +54,7 @@ def standard(
         int, typer.Option("--seed", min=0, help="0: the open set; a large one: a blind set.")
     ] = 0,
 ) -> None:
-    """Make the standard set of twelve cases: specimens, d/l, noise, speckle, resolution, lens."""
+    """Make the standard set: twelve cases of specimen, d/l, noise, speckle, resolution, lens."""
     from modeharvest.runs.benchmark.standard import make_standard
 
     with bars() as progress:
@@ -63,17 +63,17 @@ def standard(
 
 
 def leaderboard(
-    codes: Annotated[Path, typer.Argument(metavar="CODES", help="Folder of CODE/CASE.csv.")],
+    codes: Annotated[Path, typer.Argument(metavar="CODES", help="Folder of files CODE/CASE.csv.")],
     truth: Annotated[Path, typer.Option("--truth", help="The truth's folder.", metavar="DIR")],
     out: OutFolder,
 ) -> None:
-    """Grade what codes hand in for a standard set, and rank them on one page."""
+    """Grade fields that codes measured on a standard set, and rank the codes on one page."""
     from modeharvest.runs.benchmark.standard import leaderboard as ranked
 
     with bars() as progress:
         board = ranked(codes, truth, out, progress)
     for n, row in enumerate(board["codes"], 1):
-        print(f"{n}. {row['code']}: {row['rms_px']:.3g} px over {row['counted']} cases")
+        print(f"{n}. {row['code']}: rms {row['rms_px']:.3g} px, mean of {row['counted']} cases")
     for why in board["refused"].values():
         print(f"not graded: {why}")
     print(f"report: {out / 'report.html'}")

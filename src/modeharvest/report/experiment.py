@@ -243,7 +243,7 @@ def critical_line(strain: float | None, material: Mapping[str, Any] | None) -> s
 
 
 def _expected(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    missed = [text_of("experiment-missed-value", **row) for row in rows if not row["ok"]]
+    missed = [text_of("experiment-missed-value", **row) for row in rows if row["ok"] is False]
     if missed:
         return [f"Missed {len(missed)} of {len(rows)} expected values: {'; '.join(missed)}."]
     return [f"All {len(rows)} expected values are met."] if rows else []
@@ -289,8 +289,8 @@ def _symbol(snapshot: Snapshot) -> str:
 
 def expected_cards(name: str, rows: Sequence[Mapping[str, Any]]) -> list[Card]:
     """The table of that name of obtained values against expected ones, and which were met."""
-    met, missed = Mark("✓ met", True), Mark("✗ missed", False)
-    records = [{**row, "unit": row["unit"].replace("-", "–"), "ok": met if row["ok"] else missed}
+    marks = {True: Mark("✓ met", True), False: Mark("✗ missed", False), None: None}
+    records = [{**row, "unit": row["unit"].replace("-", "–"), "ok": marks[row["ok"]]}
                for row in rows]  # fmt: skip
     return Card.tabular(ReportTable.of(name, records), wide=True)
 

@@ -104,7 +104,7 @@ class ErrorMaps:
 
 def draw_distribution(scores: Sequence[Score]) -> Figure:
     """Draw which share of a field's points, lost ones counted as wrong, errs by more."""
-    drawn, axes = curve("length of the error [px]", "share of points that err by more [%]")
+    drawn, axes = curve("length of the error [px]", "share of points with a larger error [%]")
     for n, graded in enumerate(scores):
         length, points = np.sort(_error_length(graded))[::-1], graded.everywhere.points
         if len(length):
@@ -234,7 +234,7 @@ def _ranking(grading: Grading) -> list[Card]:
              *_three(*part.bias_px, part.rms_px, *part.percentiles_px, part.max_px)]
             for where, part in grading.parts(graded).items()
         ]  # fmt: skip
-    heads = ["field", "where", "points", "returned", "bias along x [px]", "along y, up [px]",
+    heads = ["field", "where", "points", "returned", "bias along x [px]", "bias along y, up [px]",
              "rms [px]", *(f"{p} % [px]" for p in PERCENTILES), "largest [px]"]  # fmt: skip
     tables = [
         ReportTable("Ranking", columns, rows, on_terminal=True),

@@ -112,7 +112,7 @@ def findings(summary: Summary) -> list[str]:
     if first is not None:
         off = _off(first, direct)
         text.append(text_of("homogenized-first-order", value=100 * first,
-                            off="" if off is None else f", {off:+.1f} %"))  # fmt: skip
+                            off="" if off is None else f" ({off:+.1f} %)"))  # fmt: skip
     mode = summary["mode"]
     if mode is not None and mode["errors"] is not None:
         change, sds = 100 * max(mode["wave_change"]), mode["wave_deviation"]

@@ -122,10 +122,10 @@ def proof(critical: Mapping[str, Any]) -> str:
         text = "the acoustic tensor of the effective moduli is singular"
     else:
         below, above = (", ".join(map(str, critical[side])) for side in ("below", "above"))
-        text = f"negative eigenvalues a millionth below: {below}, above: {above}"
+        text = f"negative eigenvalues a millionth below this load: {below}, above: {above}"
     others = len(critical["earlier"])
     return text + (f"; but {others} other waves are unstable before" if others else
-                   "; no other wave that was looked at is unstable before")  # fmt: skip
+                   "; no other wave that was examined is unstable before")  # fmt: skip
 
 
 def findings(summary: Summary) -> list[str]:

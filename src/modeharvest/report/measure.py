@@ -124,8 +124,8 @@ def _cards(
             (f"{'xy'[i]}{'xy'[j]}", partial(nodal, strain[:, i, j], "strain [-]"))
             for i, j in ((0, 0), (1, 1), (0, 1))
         ],
-        "Standard deviation of u, length": [("", partial(nodal, sd, unit, False))],
-        "The image, and the mesh’s edges where they were measured": [("", seen)],
+        "Standard deviation of u, both components": [("", partial(nodal, sd, unit, False))],
+        "Deformed image, with the mesh’s edges as measured": [("", seen)],
     }
     if result.shown == "speckle":
         panels["Residual f − g(x + u)"] = [("", left)]

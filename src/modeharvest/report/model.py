@@ -369,7 +369,7 @@ def _study_notes(summary: Mapping[str, Any]) -> list[str]:
     own = summary["versions"]["modeharvest"]
     notes = [
         f"{count} stored results of {'other options' if label == own else f'modeharvest {label}'} "
-        "are not mixed in."
+        "are not included."
         for label, count in summary["other_results_by_version"].items()
     ]
     if summary["failed"]:

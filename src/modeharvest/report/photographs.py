@@ -120,7 +120,7 @@ def photograph_labels(frames: Sequence[Frame]) -> dict[str, str]:
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
     """The few numbers at the top."""
-    last, rows = summary["frames"][-1], summary["truth"]
+    last, rows = summary["frames"][-1], [r for r in summary["truth"] if r["ok"] is not None]
     used, left = len(summary["frames"]), len(summary["skipped"])
     count, key = f"{used} of {used + left}", "some-used" if left else "all-used"
     first = KeyNumber.of(key, count, left=left)
@@ -258,16 +258,16 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
         pitch, diameter = lattice["pitch_px"], lattice["diameter_px"]
         rows = [
             ("lattice", lattice["kind"]),
-            ("holes; missing; not on it", holes),
+            ("holes on the lattice; missing; off it", holes),
             ("cell size as found", f"{number(pitch)} px = {number(pitch * px)} mm"),
             ("mean diameter d", f"{number(diameter * px)} mm, d/l {diameter / pitch:.3f}"),
-            ("holes off the straight lattice, rms", f"{lattice['misfit_px']:.2f} px"),
+            ("distance of holes from the lattice, rms", f"{lattice['misfit_px']:.2f} px"),
         ]
         text = list(lattice["text"])
     rows += [
         ("cell size as given", f"{number(summary['cell_size_mm'])} mm"),
         ("pixel size", f"{number(1000 * px)} µm"),
-        ("camera noise", f"{number(summary['noise']['sd'])} levels"),
+        ("camera noise", f"{number(summary['noise']['sd'])} grey levels"),
     ]
     drawn = partial(figures.draw_reference, harvest, states[0].view.boundary, states[0].levels)
     figure = ReportFigure("reference", "The reference", drawn, wide=True)
@@ -376,7 +376,7 @@ def _amplitude_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[
         {"photograph": names[frame["name"]], "mode": f"φ{i}",
          "state": "not " * (not mode["observable"]) + "observable" + ", fixed" * mode["fixed"],
          "largest": number(mode["largest_px"], 3),
-         "v": f"{_micro(mode['v_max_mm'], 4)} ± {_two_errors(mode)}"}
+         "v": f"{_micro(mode['v_max_mm'], 4)} {_two_errors(mode)}"}
         for frame in frames for i, mode in enumerate(frame["modes"], start=1)
     ]  # fmt: skip
     return Card.tabular(ReportTable.of("amplitudes", rows), wide=len(frames) > 1)

@@ -229,8 +229,8 @@ def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
                     raise InputError(text.splitlines()[-1])
                 if code < 0:
                     raise InputError(
-                        f"a process that measures was killed by signal {-code}, as where memory "
-                        "runs out; free some, or measure with NUMBA_NUM_THREADS=1"
+                        f"a process that measures was killed by signal {-code}, as happens when "
+                        "memory runs out; free some, or measure with NUMBA_NUM_THREADS=1"
                     )
                 if code != 0:
                     raise RuntimeError(text or f"a process that measures ended with {code}")

@@ -268,7 +268,7 @@ def shape_numbers(key: str, state: FittedState) -> str:
     if not key.startswith("phi"):
         return ""
     scale = state.shape_scale(int(key.removeprefix("phi")) - 1)
-    return f"drawn as with v = {scale:.3g} mm everywhere"
+    return f"drawn with v = {scale:.3g} mm everywhere"
 
 
 def has_mode(i: int) -> Callable[[FittedState], bool]:

@@ -352,7 +352,7 @@ def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Lin
     kinds = (
         (lattice.centres, "o", GREEN, f"{len(lattice)} holes"),
         (lattice.position(lattice.missing), "x", RED, f"{len(lattice.missing)} missing"),
-        (lattice.extra, "s", INK, f"{len(lattice.extra)} not on it"),
+        (lattice.extra, "s", INK, f"{len(lattice.extra)} off it"),
     )
     for at, marker, colour, name in kinds:
         if len(at):

@@ -55,9 +55,9 @@ def write_watch_page(
         if test.rows:
             figures["Amplitude of the pattern"] = draw_amplitude(test, last)
         if last is not None:
-            figures["Growth: where the line ends, it buckles"] = draw_growth(test, last)
+            figures["Growth: the line ends at the strain of buckling"] = draw_growth(test, last)
     content = {
-        "title": escape(title or "A test, watched"),
+        "title": escape(title or "A running test"),
         "refresh": "" if test.conclusion else f'<meta http-equiv="refresh" content="{_RELOAD_S}">',
         "lead": escape(watch_text(test)),
         "figures": "".join(
@@ -82,11 +82,11 @@ def watch_text(test: WatchedTest) -> str:
         f"pattern {last['pattern_px']:.2f} px rms. "
     )
     if found is None or not found.is_useful:
-        text += "The pattern's growth doesn't show yet when it buckles."
+        text += "The pattern's growth doesn't show yet at which strain the specimen buckles."
     else:
         text += (
-            f"It buckles at {100 * found.critical:.2f} % (95 %: {found.interval}), by growth up to "
-            f"{100 * found.largest:.2f} %."
+            f"It buckles at {100 * found.critical:.2f} % (95 % interval: {found.interval}), by "
+            f"extrapolation of the growth up to {100 * found.largest:.2f} %."
         )
     return f"{text} {test.conclusion}"
 

@@ -118,7 +118,7 @@ def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
     table = ReportTable.of_states("whole", found, heads)
     both = ("refitted to the whole displacement", "±", "by IDIC")
     columns = ("", "", *(f"{label}: {way}" for label in labels for way in both))
-    modes = ReportTable("Modes by both ways", columns, list(_mode_rows(numbers)), "whole-modes")
+    modes = ReportTable("Modes of both fits", columns, list(_mode_rows(numbers)), "whole-modes")
     return [*Card.tabular(table, wide=True), *Card.tabular(modes, wide=True)]
 
 

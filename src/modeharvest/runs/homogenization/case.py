@@ -218,14 +218,14 @@ class HomogenizationCase(CaseModel):
              "round holes in square or triangular stacking, "
              f"got {got} stacking, diameter_y = {specimen.diameter_y}"),
             (self.quarter and not (got == "square" and self.is_experiment),
-             "quarter = false but for square stacking and the experiment's own load and shape, "
+             "quarter = false except for square stacking with the experiment's load and shape, "
              "got true"),
             (specimen.grading_x or specimen.grading_y or not is_perfect,
              "a specimen without grading, scatter and tilt: one RVE stands for all of it"),
             (experiment.guided and self.is_experiment and not self.quarter,
              "quarter = true for a guided specimen, whose middle line stays straight, got false"),
             (self.homogenization.mesh and shifts not in ("find", (0.0, 0.0)),
-             f"edge_shifts of a specimen only, not of a mesh of one's own, got {shifts}"),
+             f"edge_shifts for a specimen only, not for a mesh of one's own, got {shifts}"),
         ):  # fmt: skip
             if is_wrong:
                 raise InputError(f"homogenization: expected {expected}")

@@ -233,8 +233,8 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         wanted = 1 - np.pi * specimen.diameter**2 / 4 / abs(np.linalg.det(specimen.vectors))
         is_same = np.abs(steps - np.rint(steps)).max() < _SAME > abs(abs(np.linalg.det(steps)) - 1)
         if self.case.homogenization.mesh is None and not (is_same and abs(share - wanted) < _SAME):
-            what = f"{mode.path}: expected modes of the specimen's lattice, solid to {wanted:.1%}"
-            got = f"vectors {given.primitive.round(4).tolist()} mm, solid to {share:.1%}"
+            what = f"{mode.path}: expected modes of the specimen's lattice, {wanted:.1%} solid"
+            got = f"vectors {given.primitive.round(4).tolist()} mm, {share:.1%} solid"
             remedy = "compute them for this specimen, or give a mesh of another body"
             raise InputError(f"{what}, got modes of a cell with {got}; {remedy}")
         return given
@@ -250,7 +250,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             return []
         found, count = [read_family(path) for path in mode.files], max(mode.numbers, default=1)
         if len(found) < count or any(abs(f.pitch / pitch - 1.0) > _SAME for f in found):
-            got = f"{len(found)} of {', '.join(f'{f.pitch:g}' for f in found)} mm"
+            got = f"{len(found)} with {', '.join(f'{f.pitch:g}' for f in found)} mm"
             what = f"{count} or more families of the specimen's pitch, {pitch:g} mm"
             raise InputError(f"{mode.path}: expected {what}, got {got}")
         numbers = mode.numbers or range(1, len(found) + 1)
@@ -379,7 +379,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
                 got = f"one {deviations[k]:.1f} of them ({change:.2%}) off"
             if is_far:
                 what = f"phi{k + 1}: expected wave vectors within {most} of the lattice's"
-                warnings.append(f"{what}, got {got}: is it of this lattice?")
+                warnings.append(f"{what}, got {got}: is this its lattice?")
         if warnings and not getattr(self.case.mode, "snap_anyway", False):
             raise InputError(f"{warnings[0]} If so, set snap_anyway = true in [mode]")
         return tuple(warnings)

@@ -179,7 +179,7 @@ class IdentificationCase(CaseModel):
         ImagingSpec, of_kind({"camera": CameraDistortion}, "imaging.distortion", "distortion")
     ] = ImagingSpec()
     finer_mesh_size: float | None = None
-    """Of the mesh whose residual the last steps take [mm]; by default 0.6 of the model's."""
+    """Of the mesh whose residual the last steps take [mm]; by default 0.7 of the model's."""
 
     _base: Path = PrivateAttr(Path())
 

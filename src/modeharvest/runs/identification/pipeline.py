@@ -461,12 +461,12 @@ def _path_warnings(model: Any, values: FloatArray) -> list[str]:
     try:
         whole = model.at(values, False)
     except InputError as error:
-        return [f"The states were found step by step; along the whole path: {error}"]
+        return [f"The states were found step by step; following the whole path failed: {error}"]
     pairs = zip(near, whole, strict=True)
     off = max(float(np.abs(a.displacement - b.displacement).max()) for a, b in pairs)
     if off < _SAME_MM:
         return []
-    return [f"The states were found step by step, up to {off:.2g} mm off those of the whole "
+    return [f"The states were found step by step, up to {off:.2g} mm from those of the whole "
             "path with the same parameters: they may be on another branch."]  # fmt: skip
 
 
@@ -476,7 +476,7 @@ def _surface_warnings(state: Any) -> list[str]:
     if (least := float(np.linalg.svd(F, compute_uv=False).min())) > _WRINKLES:
         return []
     return [f"At {100 * state.strain:.4g} % a stretch is {least:.3f}: free edges wrinkle below "
-            f"{_WRINKLES} (Biot), and states go with the mesh. Leave it out."]  # fmt: skip
+            f"{_WRINKLES} (Biot), and the state depends on the mesh. Leave it out."]  # fmt: skip
 
 
 def run_identification(

@@ -236,7 +236,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         """Why there is no wave whose modes could be computed; empty if there is one."""
         if self.case.modes.waves or critical.waves:
             return ""
-        what = "long waves are modes of no finite cell" if critical.found else "nothing is critical"
+        what = "long waves are modes of no finite cell" if critical.found else "no critical point"
         return f"no modes: {what}; name waves in [modes], such as waves = [[1, 1]]"
 
     def _modes(self, critical: CriticalPoint) -> tuple[ModeSet, tuple[Branch, ...]]:

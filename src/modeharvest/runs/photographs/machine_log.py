@@ -147,13 +147,13 @@ def offset_between(
     log begins with the first photograph.
     """
     if given is not None:
-        return given, (f"The log's clock is taken to be {given:+g} s ahead of the photographs'.",)
+        return given, (f"The log's clock is {given:+g} s ahead of the photographs', as given.",)
     dated = times[0] > _EPOCH
     if not dated or not log.is_dated:
         begin = float(log.time[0] - times[0]) if dated or log.is_dated else 0.0
         text = (
-            "The log is taken to begin with the first photograph, as only one of them has dates; "
-            "else give offset_s in [log]."
+            "The log is taken to begin with the first photograph, as only one of both has dates; "
+            "if that is wrong, give offset_s in [log]."
         )
         return begin, (text,) * bool(begin)
     zones = _ZONE * np.array(sorted(range(-56, 57), key=abs))

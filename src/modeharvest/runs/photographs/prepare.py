@@ -58,7 +58,7 @@ PREPARED_FILE = "prepared.json"
 LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 CODE = ("fem", "imaging", "idic", "runs")
 """What numbers from photographs depend on: libraries, and folders of the package."""
-_PLAIN = "The material has no speckle: it is told from the background by its grey level."
+_PLAIN = "The material has no speckle: it was found by its grey level."
 _ARRAYS = "shifts shifts_sd angles angles_sd matches covariance"
 
 
@@ -379,7 +379,7 @@ def _lit_as(
         return frame
     level = mean - gain * brighter * mean
     note = (
-        f"{frame.path.name}: the light had changed, its levels g became {gain:.3f} g + {level:.3g}."
+        f"{frame.path.name}: the light had changed; its levels g became {gain:.3f} g + {level:.3g}."
     )
     image = np.float32(gain) * frame.image + np.float32(level)
     return replace(frame, image=image.astype(np.float32), notes=(*frame.notes, note))

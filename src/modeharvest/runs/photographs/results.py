@@ -299,8 +299,8 @@ def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str
     }
 
 
-_FITTED = "The ansatz is fitted to a displacement: what is left of that is w."
-_ALIKE = "Displacements of all pixels of the material count alike."
+_FITTED = "The ansatz is fitted to a displacement field; w is the difference from this fit."
+_ALIKE = "All pixels of the material have the same weight in the fit."
 
 
 def harvest_summary(harvest: Harvest) -> dict[str, Any]:

@@ -196,7 +196,7 @@ def _times(
     times, source = times_of([frame.path for frame in frames])
     text = f"Times of the photographs are taken from their {source}."
     if source == "times of change":
-        text += " Those are of the files, and wrong if they were copied or edited: look at them."
+        text += " These are the files' times, wrong if files were copied or edited: check them."
     if times is None:
         text = "When the photographs were taken isn't known: give per_second in [images]."
     return times, (text,)

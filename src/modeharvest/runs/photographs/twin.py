@@ -224,19 +224,19 @@ def _frame_rows(
     px, found = result.grid.pixel_size, result.displacement()
     left, lost = (rms(field[inside]) / px for field in (true - found, best.displacement() - found))
     rows = [
-        Expectation(f"{name}: w = truth − IDIC, rms", left, "as measured", True, "px"),
+        Expectation(f"{name}: w = truth − IDIC, rms", left, "–", None, "px"),
         Expectation(f"{name}: IDIC − best fit, rms", lost, "small against w", lost < left, "px"),
     ]
     if not result.ansatz.modes or not result.ansatz.modes[0].family.size:
         return rows
     if identifiability(result, inside).unobservable:
         words = f"{name}: wave vectors and v1"
-        return [*rows, Expectation(words, "not observable", "asked of one that is", True)]
+        return [*rows, Expectation(words, "not observable", "–", None)]
     waves = result.ansatz.modes[0].family.waves(result.mode_parameters())[:, 2:4]
     off = 100 * float(np.abs(np.abs(waves) - 1.0).max())
     words = f"{name}: wave vectors, largest deviation from (±½, ±½)"
     rows.append(Expectation.at_most(words, off, _WAVES, "%"))
-    words = f"{name}: v1 − v1 of the best fit, largest over the cellular part, of its maximum"
+    words = f"{name}: v1 − v1 of the best fit, largest over the cellular part, % of largest v1"
     return [*rows, Expectation.at_most(words, v_percent(result, best), _AMPLITUDE, "%")]
 
 
@@ -246,18 +246,18 @@ def whole_checks(
     """What of one photograph's whole displacement was found, against the truth."""
     of, edges = f"{name}: whole displacement", errors.rms_edges_px
     rows = [
-        Expectation(f"{of}: truth − measured, rms", errors.rms_px, "as measured", True, "px"),
-        Expectation(f"{of}: … within 10 px of an edge", edges or 0.0, "as measured", True, "px"),
+        Expectation(f"{of}: truth − measured, rms", errors.rms_px, "–", None, "px"),
+        Expectation(f"{of}: … within 10 px of an edge", edges or 0.0, "–", None, "px"),
     ]
     has_pattern = best.ansatz.modes and best.ansatz.modes[0].family.size
     if not has_pattern or identifiability(best, inside).unobservable:
         return rows
     v, waves = v_percent(refit, best), waves_percent(refit, best)
-    words = f"{of}: v1 of the refitted ansatz − of the best fit, largest, of its maximum"
+    words = f"{of}: v1 of the refitted ansatz − of the best fit, largest, % of largest v1"
     return [
         *rows,
         Expectation.at_most(words, v, _REFIT_AMPLITUDE, "%"),
-        Expectation.at_most(f"{of}: wave vectors likewise", waves, _REFIT_WAVES, "%"),
+        Expectation.at_most(f"{of}: wave vectors, % of their length", waves, _REFIT_WAVES, "%"),
     ]
 
 
