@@ -4,7 +4,7 @@ scripts/env python benchmarks/watch.py            # predictions, 32 seeds
 scripts/env python benchmarks/watch.py --step 0.01 --last 0.7    # a photograph every hundredth
 scripts/env python benchmarks/watch.py --time     # seconds a photograph of 3 Mpx
 scripts/env python benchmarks/watch.py --memory harvest 20 200    # peak of so many photographs
-scripts/env python benchmarks/watch.py --memory measure 5 25
+scripts/env python benchmarks/watch.py --memory measure 20
 scripts/env python benchmarks/watch.py --seeds 1 --picture docs/images/watch.png
 
 Specimens of the paper's kind, 6 x 10 holes scattered by 0.01 mm in place and diameter, simulated at

@@ -1,6 +1,6 @@
 """Mode families of real lattice modes: the square lattice's is Eq. (mode), the flower is six waves.
 
-Guards: the paper's reading of Fig. "modes" for the square stacking under every loading, at every
+Guards: the paper's reading of Fig. 2 for the square stacking under every loading, at every
 origin and on meshes without symmetry; what is found on the post-buckled branch; the symmetries of
 the hexagonal modes; and that the recipe of docs/explanation/families.md runs.
 """

@@ -59,7 +59,7 @@ def test_the_study_case_studies_what_the_paper_and_the_defaults_do() -> None:
         default.loadings,
         default.overlays,
     )
-    assert {0.25, 0.7895, 0.95} <= set(plan.overlays)  # Fig. "graded": 0.25, 0.79, 0.95
+    assert {0.25, 0.7895, 0.95} <= set(plan.overlays)  # Fig. 8: 0.25, 0.79, 0.95
 
 
 @pytest.mark.parametrize(

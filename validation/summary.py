@@ -198,7 +198,7 @@ def _of_stable(snapshot: SnapshotSummary, at: str) -> list[Expectation]:
     return [
         Expectation("pattern inside over pattern in the corners" + at, inner / corners,
                     "below 1: v₁ near zero except at the corners", inner < corners, "-",
-                    PAPER + ", Fig. (virt)"),
+                    PAPER + ", Fig. 5"),
     ]  # fmt: skip
 
 

@@ -381,7 +381,7 @@ class StudyPlan:
     materials: tuple[str, ...] = ()
     """Names among ``STUDIED_MATERIALS``."""
     overlays: tuple[float, ...] = (0.95, 0.7895, 0.25)
-    """d/l of the pictures of numerical over analytic mode [-]; as in the paper's Fig. "graded"."""
+    """d/l of the pictures of numerical over analytic mode [-]; as in Fig. 8 of the paper."""
     divisions: int = 13
     """Elements along l."""
     largest: float = 0.28

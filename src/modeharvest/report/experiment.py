@@ -166,7 +166,7 @@ _WHOLE_MAPS: WholeMaps[SnapshotState] = WholeMaps(
 
 def snapshot_panels(modes: int) -> list[fits.Panel[SnapshotState]]:
     """Every quantity that is drawn of a snapshot, for an ansatz of so many modes."""
-    spectra, fields = ("spect_virt", "virt") if modes <= 1 else ("", "")  # the paper has one
+    spectra, fields = ("4", "5") if modes <= 1 else ("", "")  # the paper has one
     return [
         fits.Panel("images", "image", _image, figure=spectra),
         *fits.spectrum_panels("images", spectra, "snapshots", fits.always),
@@ -371,9 +371,9 @@ def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
         ("images", "found", "errors", "whole"), snapshot_panels(data.modes), data.states,
         lambda key, state: panel_numbers(key, snapshots[state.k]) or fits.shape_numbers(key, state),
         pattern=Markup("Σ v<sub>i</sub>φ<sub>i</sub>" if several else "v<sub>1</sub>φ<sub>1</sub>"),
-        of_spectra="" if several else "Fig. “spect_virt” of the paper. ",
+        of_spectra="" if several else "Fig. 4 of the paper. ",
         known="",
-        source="" if several else "Fig. “virt” of the paper. ",
+        source="" if several else "Fig. 5 of the paper. ",
     )  # fmt: skip
     text = {s.label: snapshots[s.k].get("pattern_reading", ()) for s in data.states}
     reading = Card("Reading of the densities", text=text, name="reading")

@@ -241,7 +241,7 @@ def _pattern_section(run: LatticeRun) -> Section:
     reference = ReportFigure("reference", "Reference", drawn, "dashed: the cell that repeats")
     cards = [
         Card(found.name, [*([reference] if n == 1 else []), _deformed(run, found, n),
-                          *_densities(found, n)], paper="paper: Fig. modes", wide=True)
+                          *_densities(found, n)], paper="paper: Fig. 2", wide=True)
         for n, found in enumerate(run.patterns, start=1)
     ]  # fmt: skip
     cards = cards or [Card("The lattice", [reference])]

@@ -1,4 +1,4 @@
-"""Report of photographs: one page like the paper's Figs. "spect_real" and "real"."""
+"""Report of photographs: one page like the paper's Figs. 6 and 7."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         _PANELED, photograph_panels(states), states,
         lambda key, s: panel_numbers(key, frames[s.frame.name]) or fits.shape_numbers(key, s),
         known="These photographs were made by a simulation, so the truth is known. ",
-        source="Fig. “real” of the paper. ", pattern=Markup("v<sub>1</sub>φ<sub>1</sub>"),
+        source="Fig. 7 of the paper. ", pattern=Markup("v<sub>1</sub>φ<sub>1</sub>"),
     )  # fmt: skip
     drawn: list[Section] = []
     if harvest:
@@ -227,12 +227,12 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
     panels: list[fits.Panel[PhotographState]] = [
         Panel("photographs", "image", figures.draw_deformed, text="photograph"),
         Panel("photographs", "closeup", figures.draw_closeup, values={"cells": figures.CLOSE}),
-        *fits.spectrum_panels("photographs", "spect_real", "photographs", has_spectrum),
+        *fits.spectrum_panels("photographs", "6", "photographs", has_spectrum),
         *(Panel("photographs", f"S{axis}{axis}-part{k + 1}",
                 partial(figures.draw_part_spectrum, part=k, component=c), text=f"part-{axis}",
                 values={"part": part.name if part.name == "w" else f"region “{part.name}”"})
           for k, part in enumerate(parts) for c, axis in enumerate("xy")),
-        *fits.ansatz_panels("found", "real", modes),
+        *fits.ansatz_panels("found", "7", modes),
         *figures.WHOLE_MAPS.panels(),
         Panel(last, "residual", figures.draw_residual, has_residual, "photograph-residual",
               exact=True),

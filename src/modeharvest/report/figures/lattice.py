@@ -93,7 +93,7 @@ def draw_growth(patch: LatticePatch, shape: FloatArray, amplitude: float, pitch:
 def draw_overlay(
     mesh: Mesh, pitch: float, numerical: FloatArray, analytic: FloatArray, largest: float
 ) -> Figure:
-    """Draw one cell deformed by two modes of the same size: the paper's Fig. "graded".
+    """Draw one cell deformed by two modes of the same size: Fig. 8 of the paper.
 
     ``mesh``: a quarter of the mode's cell [mm]. ``pitch``: unit cell size l [mm]. ``numerical``,
     ``analytic``: (n, 2) both modes at its nodes, of equal norm over the material. ``largest``:
