@@ -1,6 +1,6 @@
 """The ansatz u(x) = v0(x) + sum_i v_i(x) phi_i(x): unknowns, fields, sensitivities.
 
-And, if asked for, how the images' brightness differs.
+Optionally also a gain and an offset between the images' grey levels.
 
 Source: the paper's Eq. (u_dic). Everything is in mm in the physical frame (x right, y up).
 """
@@ -22,7 +22,7 @@ from modeharvest.util.errors import InputError
 
 
 def ansatz_from_dict(content: Mapping[str, Any]) -> Ansatz:
-    """Make the ansatz that :func:`~modeharvest.util.typed.to_plain` described."""
+    """Rebuild an ansatz from the dictionary that :func:`~modeharvest.util.typed.to_plain` made."""
     modes = (
         FourierMode(
             ModeFamily(**mode["family"]),
@@ -38,11 +38,11 @@ def ansatz_from_dict(content: Mapping[str, Any]) -> Ansatz:
 
 
 HIGHEST_DEGREE = 20
-"""Of a slow field: 231 unknowns for a component; higher ones show waves as short as the pattern."""
+"""Highest total degree of v0 and v_i: 231 unknowns per field; above it they resolve the pattern."""
 
 
 def require_degrees(v0_degree: int, v_degree: int) -> None:
-    """Raise InputError unless v0 and v_i can be of these degrees."""
+    """Raise InputError unless the degrees of v0 and v_i are within their limits."""
     if not (1 <= v0_degree <= HIGHEST_DEGREE and 0 <= v_degree <= HIGHEST_DEGREE):
         raise InputError(
             f"expected v0_degree from 1 and v_degree from 0 to {HIGHEST_DEGREE}, got {v0_degree} "
@@ -52,14 +52,14 @@ def require_degrees(v0_degree: int, v_degree: int) -> None:
 
 @dataclass(frozen=True)
 class AnsatzOptions:
-    """Degrees of an ansatz; the paper's by default."""
+    """Polynomial degrees of an ansatz; the paper's by default."""
 
     v0_degree: int = 5
     v_degree: int = 6
     """Total degrees of the Chebyshev polynomials of v0 and of every v_i."""
     gain_degree: int | None = None
     offset_degree: int | None = None
-    """Total degrees of a gain and of an offset between the images' grey levels; None for none."""
+    """Total degrees, 0 to 6, of gain and offset between the images' grey levels; None for none."""
 
     def __post_init__(self) -> None:
         require_degrees(self.v0_degree, self.v_degree)
@@ -67,20 +67,20 @@ class AnsatzOptions:
 
     @property
     def brightness(self) -> Brightness:
-        """Which of gain and offset are unknowns."""
+        """Gain and offset of the grey levels, as far as they are unknowns."""
         return Brightness(self.gain_degree, self.offset_degree)
 
 
 _Degrees = TypeVar("_Degrees", bound="AnsatzOptions | Ansatz")
 FEWEST_CELLS = 3
-"""Across a pattern, below which its mode is off by percents whatever the degrees are."""
+"""Fewest cells across a pattern: with fewer, its mode is off by percents whatever the degrees."""
 
 
 def for_cells(degrees: _Degrees, specimen: Box, pattern: Box, cell_size: float) -> _Degrees:
-    """Lower the degrees of v0 and v_i to those that boxes of few cells [mm] can tell.
+    """Lower the degrees of v0 and v_i to what boxes [mm] only a few cells wide can determine.
 
-    To two for every cell across but the first, and at least two: with more v1 and the mode's
-    parameters replace one another (``benchmarks/few_cells.py``).
+    The limit is 2 (n - 1) for n cells across the box, but at least 2: above it, v1 and the mode's
+    parameters can replace one another (``benchmarks/few_cells.py``).
     """
     v0, v = (max(2, 2 * round(cells_across(box, cell_size)) - 2) for box in (specimen, pattern))
     return replace(degrees, v0_degree=min(v0, degrees.v0_degree), v_degree=min(v, degrees.v_degree))
@@ -100,14 +100,14 @@ class Ansatz:
     """
 
     domain: Box
-    """The box that the Chebyshev polynomials span; the whole specimen [mm]."""
+    """Box on which the Chebyshev polynomials are defined [mm]: the whole specimen."""
     modes: tuple[FourierMode, ...] = ()
     """phi_1 ... phi_n; none gives a plain global DIC with v0 alone."""
     v0_degree: int = 5
     v_degree: int = 6
     """Total degrees of v0 (5 in the paper) and of every v_i (6)."""
     brightness: Brightness = field(default_factory=Brightness)
-    """Whether gain and offset of the grey levels are unknowns, too; by default not."""
+    """Gain and offset of the grey levels, if they are unknowns too; by default they are not."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "modes", tuple(self.modes))
@@ -123,8 +123,8 @@ class Ansatz:
     ) -> Ansatz:
         """Make an ansatz of mode families, each on a part of the domain [mm].
 
-        Each family comes with the cellular part [mm] that its mode fades out of over half a unit
-        cell, ``cell_size`` being l [mm]; the options' degrees are the paper's by default.
+        Each family comes with the box [mm] of the cellular part, outside which its mode tapers off
+        over half a unit cell. ``cell_size`` is l [mm]; the degrees are the paper's by default.
         """
         how = options or AnsatzOptions()
         modes = tuple(
@@ -137,7 +137,7 @@ class Ansatz:
     def square(
         cls, specimen: Specimen, *, fixed_mode: bool = False, options: AnsatzOptions | None = None
     ) -> Ansatz:
-        """:meth:`of_specimen` in square stacking; InputError for any other."""
+        """Call :meth:`of_specimen`; raises InputError unless the stacking is square."""
         if specimen.stacking != "square":
             raise InputError(
                 f"Ansatz.square: expected a specimen in square stacking, got {specimen.stacking} "
@@ -149,14 +149,14 @@ class Ansatz:
     def of_specimen(
         cls, specimen: Specimen, *, fixed_mode: bool = False, options: AnsatzOptions | None = None
     ) -> Ansatz:
-        """Make the ansatz with a specimen's modes; the paper's 77 unknowns in square stacking.
+        """Make the ansatz with a specimen's modes; in square stacking the paper's 77 unknowns.
 
-        The modes start as those of the specimen's infinite lattice (``idic.modes.FAMILIES``), with
-        their phases anchored at its holes: [1, 1, 1, -1, 1, 0, 0] in square stacking with an even
-        number of holes both ways. The specimen's middle is the origin.
+        The initial modes are those of the infinite lattice (``idic.modes.FAMILIES``), with phases
+        such that they fit the specimen's holes: [1, 1, 1, -1, 1, 0, 0] in square stacking with an
+        even number of holes along x and along y. The origin is the specimen's centre.
 
-        fixed_mode : Keep the modes at the ideal pattern, for images without a pattern to find them
-            from.
+        fixed_mode : Keep the modes fixed at the ideal pattern; for images that show no pattern from
+            which they could be found.
         options : Degrees; the paper's by default.
         """
         (a, b), (width, height) = specimen.cellular_half_size, specimen.half_size
@@ -167,12 +167,12 @@ class Ansatz:
 
     @property
     def v0_space(self) -> ChebyshevField:
-        """The space of either component of v0."""
+        """The polynomial space of each component of v0."""
         return ChebyshevField(self.domain, self.v0_degree)
 
     @property
     def v_space(self) -> ChebyshevField:
-        """The space of every v_i."""
+        """The polynomial space of every v_i."""
         return ChebyshevField(self.domain, self.v_degree)
 
     @property
@@ -186,12 +186,12 @@ class Ansatz:
         return not any(mode.family.size for mode in self.modes)
 
     def v0_slice(self, component: int) -> slice:
-        """Where v0 along x (0) or y (1) is among the unknowns."""
+        """Slice of the unknowns that holds v0 along x (0) or y (1)."""
         n = self.v0_space.size
         return slice(component * n, (component + 1) * n)
 
     def v_slice(self, i: int) -> slice:
-        """Where v of the mode number i (from 0) is among the unknowns."""
+        """Slice of the unknowns that holds v of the mode number i (from 0)."""
         first = 2 * self.v0_space.size + i * self.v_space.size
         return slice(first, first + self.v_space.size)
 
@@ -201,7 +201,7 @@ class Ansatz:
         return slow + sum(mode.family.size for mode in self.modes[:i])
 
     def phi_slice(self, i: int) -> slice:
-        """Where the parameters of the mode number i (from 0) are among the unknowns."""
+        """Slice of the unknowns that holds the parameters of the mode number i (from 0)."""
         return slice(self.phi_offset(i), self.phi_offset(i + 1))
 
     @property
@@ -232,13 +232,13 @@ class Ansatz:
         return a
 
     def initial_guess(self, strain: float = 0.0, amplitude: float = 1.0) -> FloatArray:
-        """Where a correlation begins, as in the paper.
+        """Make the initial guess of a correlation, (size,) unknowns, as in the paper.
 
         strain : Nominal compression along x [-], the shortening over the length of the cellular
             part; v0x = -strain (x - centre), so that the ends of the cellular part move by half the
             shortening. Positive in compression.
-        amplitude : The constant that every v_i starts with [mm]; not zero, because the modes would
-            not be observable. 1 mm with max ||phi|| = 0.04 is a pattern of 40 um.
+        amplitude : Constant initial value of every v_i [mm]; not zero, because the modes would not
+            be observable. 1 mm with max ||phi|| = 0.04 is a pattern of 40 um.
         """
         a = np.zeros(self.size)
         a[self.v0_slice(0)][1] = -strain * self.domain.half[0]
@@ -251,7 +251,7 @@ class Ansatz:
         """(..., 2): the slow field [mm]; positions as in :meth:`displacement`."""
         a, (x, y) = self.checked(a), open_grid(x, y)
         space = self.v0_space
-        # Each component in one piece: faster to work on.
+        # Each component in a contiguous array: faster to work on.
         components = np.empty((2, *np.broadcast_shapes(x.shape, y.shape)))
         for c in (0, 1):
             space.evaluate(a[self.v0_slice(c)], x, y, components[c])
@@ -293,14 +293,14 @@ class Ansatz:
     def gain_and_offset(
         self, a: ArrayLike, x: ArrayLike, y: ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
-        """1 + b [-] and c [grey levels]: f = (1 + b) g(x + u) + c; 1 and 0 if not unknown."""
+        """1 + b [-] and c [grey levels]: f = (1 + b) g(x + u) + c; 1 and 0 where not unknowns."""
         a, (x, y) = self.checked(a), open_grid(x, y)
         return self.brightness.evaluate(self.domain, a[self.phi_offset(len(self.modes)) :], x, y)
 
     def sensitivities(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(..., 2, size): derivatives of the displacement with respect to the unknowns.
 
-        Zero for gain and offset. For tests and few points; the correlation itself never forms it.
+        Zero for gain and offset. For tests and few points; the correlation never forms this array.
         """
         a, (x, y) = self.checked(a), open_grid(x, y)
         x, y = np.broadcast_arrays(x, y)
@@ -316,7 +316,7 @@ class Ansatz:
 
 
 def open_grid(x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two one-dimensional axes as an open grid; anything else unchanged."""
+    """Turn two one-dimensional axes into an open grid; return anything else unchanged."""
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if x.ndim == 1 and y.ndim == 1:
         return x[None, :], y[:, None]

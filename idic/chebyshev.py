@@ -1,8 +1,8 @@
-"""Chebyshev polynomials on a box, and gain and offset of the grey levels made of them.
+"""Chebyshev polynomials on a box, and the gain and offset of the grey levels expanded in them.
 
 A field of total degree D is the sum of c_ij T_i(xi) T_j(eta) over i + j <= D, where xi and eta run
-from -1 to 1 across the box: 21 terms for D = 5, 28 for D = 6. So vary v0, every v_i, and the gain 1
-+ b and offset c in f(x) = (1 + b(x)) g(x + u(x)) + c(x).
+from -1 to 1 across the box: 21 terms for D = 5, 28 for D = 6. v0, every v_i, the gain 1 + b and the
+offset c in f(x) = (1 + b(x)) g(x + u(x)) + c(x) are such fields.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class ChebyshevField:
         return (self.degree + 1) * (self.degree + 2) // 2
 
     def square(self, coefficients: ArrayLike) -> FloatArray:
-        """(degree + 1, degree + 1) array [i, j], zero where i + j > degree."""
+        """Coefficients as an array [i, j], (degree + 1, degree + 1), zero where i + j > degree."""
         matrix = np.zeros((self.degree + 1, self.degree + 1))
         i, j = np.array(self.orders).T
         matrix[i, j] = coefficients
@@ -143,12 +143,12 @@ class ChebyshevField:
 
 @dataclass(frozen=True)
 class Brightness:
-    """Which of gain and offset are unknowns, and how finely they vary."""
+    """Which of gain and offset are unknowns, and their polynomial degrees."""
 
     gain_degree: int | None = None
-    """Total degree of b; 0 is one number for the whole image, None (the default) no gain."""
+    """Total degree of b, 0 to 6; 0 is one number for the image, None (the default) no gain."""
     offset_degree: int | None = None
-    """Total degree of c, likewise."""
+    """Total degree of c, in the same way."""
 
     def __post_init__(self) -> None:
         for name, degree in self._each:
@@ -160,7 +160,7 @@ class Brightness:
 
     @property
     def degrees(self) -> tuple[int, ...]:
-        """Those that are unknowns, the gain's first."""
+        """Degrees of those of gain and offset that are unknowns, the gain's first."""
         return tuple(degree for _, degree in self._each if degree is not None)
 
     @property
@@ -208,7 +208,7 @@ class Brightness:
         return result
 
     def fields(self, first: int) -> tuple[int, int]:
-        """Numbers of the base fields of gain and offset, from ``first`` on; 0 for none."""
+        """Indices of the base fields of gain and offset, counted from ``first``; 0 for none."""
         gain = 0 if self.gain_degree is None else first
         offset = 0 if self.offset_degree is None else first + (gain > 0)
         return gain, offset

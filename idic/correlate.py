@@ -1,4 +1,4 @@
-"""Integrated digital image correlation; and the best fit of an ansatz to a known field."""
+"""Integrated digital image correlation, and the best fit of an ansatz to a known displacement."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ from modeharvest.util.progress import Progress, silent
 from modeharvest.util.scaled_eigen import ScaledEigen
 
 WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
-"""Outcomes with nothing to assess."""
+"""Outcomes without unknowns that could be assessed."""
 ASTRAY = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
-"""Outcomes that are neither a result nor a start."""
+"""Outcomes whose unknowns are neither a result nor an initial guess."""
 _FINEST_PX = 4.0
-"""Finer speckle is aliased by the pixels; a filter keeps that out of what weighs the residual."""
+"""Finer speckle is aliased by the pixels: the gradient that weighs the residual is filtered."""
 
 
 def correlate(
@@ -66,15 +66,15 @@ def correlate(
     Minimises 1/2 sum (f(x) - g(x + u(x, a)))^2 over the pixels of the reference that show material:
     the paper's Eqs. (r), (dof_opt) and (u_dic).
 
-    InputError if both strain and guess are given, or the guess isn't one for the ansatz.
+    Raises InputError if both strain and guess are given, or the guess doesn't fit the ansatz.
 
-    pair : Of images. Without a mask every pixel counts; without a deformed mask g is taken as it
-        is.
+    pair : The image pair. Without a mask every pixel counts; without a deformed mask g is used
+        unchanged.
     ansatz : The kinematics.
-    strain : Nominal compression along x that the initial guess has, see
-        :meth:`Ansatz.initial_guess` [-]; by default the pair's, or 0 where that isn't known.
-    guess : (size,) unknowns to begin with, instead.
-    options, progress : How to correlate; listener.
+    strain : Nominal compression along x of the initial guess [-], see
+        :meth:`Ansatz.initial_guess`; by default the pair's, or 0 where that isn't known.
+    guess : (size,) initial unknowns, instead of a strain.
+    options, progress : How to correlate; progress listener.
     """
     options = options or CorrelationOptions()
     course, levels = _Course(options, progress), options.levels
@@ -96,7 +96,7 @@ def correlate(
             smoothing = FinalSmoothing.given(pair, options.final_smoothing_px)
     if smoothing is not None and smoothing.blur_px > 0.0:
         pair = smoothed_pair(pair, smoothing.blur_px)
-        ansatz = replace(ansatz, brightness=Brightness())  # which local normalisation takes away
+        ansatz = replace(ansatz, brightness=Brightness())  # removed by local normalisation
     size_px = speckle_size(pair.reference, pair.mask)
     order = options.order or spline_order(size_px)
     reached = course.through(levels, pair, ansatz, a[: ansatz.size], order)
@@ -109,9 +109,9 @@ def correlate(
 def refitted_result(
     pair: ImagePair, ansatz: Ansatz, unknowns: FloatArray, options: CorrelationOptions
 ) -> Result:
-    """Make a result of unknowns (n,) that a correlation would not keep: what the images say there.
+    """Make a result at given unknowns (n,) without iterating: the residual and covariance there.
 
-    Unknown gain and offset give both images one mean and one contrast.
+    Gain and offset, if unknowns that are all 0, are set to equalise the images' mean and contrast.
     """
     a = _with_gain_and_offset(ansatz, unknowns, pair)
     size_px = speckle_size(pair.reference, pair.mask)
@@ -127,16 +127,16 @@ def refitted_result(
 def best_fit(
     truth: Truth, result: Result, *, guesses: Sequence[FloatArray] = (), progress: Progress = silent
 ) -> Result:
-    """Fit a result's ansatz to the true displacement: what the measurement could find at best.
+    """Fit a result's ansatz to the true displacement: the best that the measurement could find.
 
-    The best that is reached from the result and from other guesses, (n,) unknowns each. Which that
-    is, and most of the way there, is found on some tens of thousands of pixels: the ansatz is
-    smooth, and its minima are far apart. Where the truth's displacement is NaN it doesn't count.
+    The fit starts from the result's unknowns and from each of ``guesses``, (n,) unknowns; the best
+    minimum is kept. It is selected and approached on some tens of thousands of pixels: the ansatz
+    is smooth, and its minima are far apart. Pixels with a NaN displacement don't count.
     """
     grid, ansatz, displacement = result.grid, result.ansatz, truth.displacement
     mask = np.isfinite(displacement[..., 0])
     every = max(1, int(np.sqrt(mask.sum() / _ENOUGH)))
-    # As far from the first row and column as from the last: a symmetric field stays symmetric.
+    # The subset is centred in the image: a symmetric field stays symmetric.
     top, left = ((size - 1) % every // 2 for size in grid.shape)
     few = np.s_[top::every, left::every]
     rows, cols = mask[few].shape
@@ -154,9 +154,9 @@ def best_fit(
 
 
 _ENOUGH = 40_000
-"""Pixels of material that tell one minimum of the best fit from another."""
+"""Pixels of material that suffice to tell one minimum of the best fit from another."""
 _CLOSE = GaussNewtonOptions(tolerance_px=1e-5)
-"""A tenth of a correlation's tolerance: the best fit is what that is measured by."""
+"""A tenth of a correlation's tolerance: correlations are compared with the best fit."""
 
 
 def fit_displacement(
@@ -168,22 +168,22 @@ def fit_displacement(
     options: GaussNewtonOptions | None = None,
     progress: Progress = silent,
 ) -> Result:
-    """Fit an ansatz to a known displacement as well as it can: what IDIC could find at best.
+    """Fit an ansatz to a known displacement by least squares: the best that IDIC could find.
 
-    Minimises 1/2 sum ||u(x) - u(x, a)||^2 over the pixels with the same engine.
+    Minimises 1/2 sum ||u(x) - u(x, a)||^2 over the pixels with the solver of the correlation.
 
     Its ``residual_rms`` is in mm *per component*; sqrt(2) times it is the rms of the norm.
     InputError if sizes differ, the mask is empty or the displacement is NaN inside it.
 
     displacement : (rows, cols, 2) u at the reference pixels [mm]; may be NaN outside the mask.
-    grid, ansatz, guess : The pixels, the kinematics, and (size,) unknowns to begin with.
+    grid, ansatz, guess : The pixels, the kinematics, and (size,) initial unknowns.
     mask : (rows, cols) True where the displacement counts; everywhere by default.
-    options, progress : Tolerances and limits; listener.
+    options, progress : Tolerances and limits; progress listener.
     """
     options = options or GaussNewtonOptions()
     course = _Course(CorrelationOptions(gauss_newton=options), progress)
     guess = ansatz.checked(guess)
-    ansatz = replace(ansatz, brightness=Brightness())  # of which a displacement says nothing
+    ansatz = replace(ansatz, brightness=Brightness())  # not observable in a displacement
     target = np.asarray(displacement, dtype=np.float64)
     if target.shape != (*grid.shape, 2):
         raise InputError(
@@ -208,7 +208,7 @@ def fit_displacement(
 def _initial_guess(
     pair: ImagePair, ansatz: Ansatz, strain: float | None, guess: ArrayLike | None
 ) -> FloatArray:
-    """The unknowns given, or those of a homogeneous strain."""
+    """Return the given unknowns, or those of a homogeneous strain."""
     if guess is None:
         known = pair.strain if strain is None else strain
         return ansatz.initial_guess(0.0 if np.isnan(known) else known)
@@ -219,7 +219,7 @@ def _initial_guess(
 
 @dataclass(frozen=True, eq=False)
 class _Reached:
-    """The minimum on a level with all steps to it, its pixels, and the whole ansatz' unknowns."""
+    """The minimum on a level with all iterations up to it, its pixels, and all unknowns."""
 
     search: LevelSearch
     found: Minimum
@@ -228,24 +228,24 @@ class _Reached:
 
 
 class _Course:
-    """A correlation on its way: its options and its progress."""
+    """A running correlation: its options and its progress."""
 
     def __init__(self, options: CorrelationOptions, progress: Progress) -> None:
         self.options, self.progress = options, progress
         self.count, self.done = 1, 0
 
     def report(self, number: int) -> None:
-        """Tell the listener of an iteration."""
+        """Report an iteration to the progress listener."""
         most = self.options.gauss_newton.max_iterations + 1
         self.progress(self.done + number / most, self.count, "correlate")
 
     def through(
         self, levels: tuple[Level, ...], pair: ImagePair, ansatz: Ansatz, a: FloatArray, order: int
     ) -> _Reached:
-        """Go through levels; on the last one all unknowns are sought, to the full tolerance.
+        """Correlate level by level; the last one solves for all unknowns, to the full tolerance.
 
-        Where gain or offset are unknowns, coarse levels see locally normalised images: what the
-        brightness could absorb there is much of the blurred speckle itself.
+        If gain or offset are unknowns, coarse levels use locally normalised images without them:
+        there, they could absorb much of the blurred speckle itself.
         """
         edge_px, before = self.options.edge_px, a
         history: tuple[Iteration, ...] = ()
@@ -285,10 +285,10 @@ def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple
 
 
 def _with_gain_and_offset(ansatz: Ansatz, guess: FloatArray, pair: ImagePair) -> FloatArray:
-    """Begin with a gain and an offset that give both images one mean and one contrast.
+    """Set an initial gain and offset that give both images the same mean and contrast.
 
-    Far from the solution, where the images don't match yet, a fit would sooner wipe out the
-    contrast than find the displacement. A guess that has gain or offset already is kept.
+    Far from the solution, where the images don't match yet, a fit would rather remove the contrast
+    than find the displacement. A guess that contains gain or offset already is kept.
     """
     first = ansatz.phi_offset(len(ansatz.modes))
     if first == ansatz.size or guess[first:].any():
@@ -307,7 +307,7 @@ def _with_gain_and_offset(ansatz: Ansatz, guess: FloatArray, pair: ImagePair) ->
 def make_result(
     ansatz: Ansatz, grid: PixelGrid, found: Minimum, how: Propagation | None = None
 ) -> Result:
-    """Make a result of a minimum, or of a root; of the residual it knows the size alone."""
+    """Make a result from a minimum, or with ``how`` from a root; its residual test isn't set."""
     matrix = found.equations.matrix
     eigen = ScaledEigen.of(matrix if how is None else how.slope)
     inverse, weight = eigen.inverse(), matrix if how is None else how.weight
@@ -330,9 +330,9 @@ def make_result(
 def _assessed(
     reached: _Reached, pair: ImagePair, size_px: float, course: _Course
 ) -> tuple[Result, tuple[Iteration, ...]]:
-    """Test the residual, and move on to where another gradient weighs it, if it is to.
+    """Test the residual, and solve again with another weighting gradient where that is due.
 
-    Returns the result, and the further steps alone.
+    Returns the result, and the additional iterations alone.
     """
     result = _result(reached, reached.found, size_px)
     weighting = _weighting(result, size_px, course.options)
@@ -353,7 +353,7 @@ def _result(
     weighting: Weighting | None = None,
     how: Propagation | None = None,
 ) -> Result:
-    """Make a result with its residual test; by default that of least squares."""
+    """Make a result with its residual test; by default with the weighting of least squares."""
     ansatz, pair, used = reached.search.ansatz, reached.search.pair, reached.used
     left = residual(used, found.unknowns, pair.reference, pair.deformed)
     lost, lags_px = decorrelated_fraction(pair.reference, left), lags_for(size_px)
@@ -371,11 +371,11 @@ def _result(
 
 
 def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> Weighting:
-    """What is to weigh the residual: as specified, or as the noise asks for.
+    """Choose the gradient that weighs the residual: as specified, or according to the noise.
 
-    The reference's gradient if the residual is noise, blurred as makes the unknowns' variance
-    smallest; otherwise the deformed image's. Of the finest speckle the reference's in any case:
-    it is aliased, in the residual and in the deformed image's gradient alike.
+    If the residual is noise, the reference's gradient with the blur that minimises the unknowns'
+    variance; otherwise the deformed image's. For the finest speckle always the reference's: such
+    speckle is aliased, in the residual and in the deformed image's gradient alike.
     """
     is_noise, is_aliased = result.residual_test().is_white, size_px < _FINEST_PX
     gradient, blur_px, low_pass = options.gradient, options.gradient_blur_px, False

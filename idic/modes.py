@@ -2,7 +2,7 @@
 
 A mode is phi(x) = s tau(x) sum_w (A_w, B_w) sin(pi/l (kx_w x + ky_w y + c_w)): k is
 dimensionless (1 is a wavelength of 2 l), c is in mm, s is a fixed scale and tau the support.
-A family says how the few parameters a of the mode make the five of each wave, P = C a + P0;
+A family maps the few parameters a of the mode to the five parameters of each wave, P = C a + P0;
 the paper's Eq. (mode) is one of them.
 """
 
@@ -22,7 +22,7 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True)
 class Taper:
-    """The factor tau(x) = tau_x(x) tau_y(y) of a mode."""
+    """Support of a mode: the factor tau(x) = tau_x(x) tau_y(y)."""
 
     cellular: Box
     """Region where tau = 1 [mm]."""
@@ -58,16 +58,16 @@ class ModeFamily:
     """A linear map from a mode's parameters to its waves."""
 
     name: str
-    """What to call the family, e.g. "square, origin at a junction"."""
+    """Name of the family, e.g. "square, origin at a junction"."""
     matrix: FloatArray
     """(5 w, m): C, from the m parameters to A, B, kx, ky, c of each of the w waves."""
     offset: FloatArray
-    """(5 w,): P0, what the parameters can't change."""
+    """(5 w,): P0, the part of the waves that doesn't depend on the parameters."""
     start: FloatArray
-    """(m,): where a correlation begins."""
+    """(m,): initial parameters of a correlation."""
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    """Of the parameters, m each; by default a1, a2, ... and "-"."""
+    """Names and units of the m parameters; by default a1, a2, ... and "-"."""
 
     def __post_init__(self) -> None:
         for key in ("matrix", "offset", "start"):
@@ -108,7 +108,7 @@ class ModeFamily:
         return full.reshape(-1, PER_WAVE)
 
     def fixed(self) -> ModeFamily:
-        """The family whose only mode is this one's start: no parameters are left.
+        """Make the family whose only mode is the ``start`` of this one: it has no parameters.
 
         For images without a pattern, in which the mode's parameters aren't observable.
         """
@@ -116,10 +116,10 @@ class ModeFamily:
         return ModeFamily(f"{self.name}, fixed", np.zeros((waves.size, 0)), waves, np.zeros(0))
 
     def moved(self, shift: ArrayLike) -> ModeFamily:
-        """Make the family whose start is this one's moved by ``shift`` (2,) [mm].
+        """Make the family whose start is this family's, translated by ``shift`` (2,) [mm].
 
-        For a specimen whose origin isn't where the mode was found to have its own; raises
-        InputError if the family's phases can't follow.
+        For a specimen whose origin differs from the one for which the mode was found; raises
+        InputError if the family's phases aren't free to follow.
         """
         change = np.zeros((self.wave_count, PER_WAVE))
         change[:, 4] = -self.waves(self.start)[:, 2:4] @ np.asarray(shift, dtype=np.float64)
@@ -153,7 +153,7 @@ def square_family(origin: str = "junction") -> ModeFamily:
 
 
 def rotation_family(specimen: Specimen) -> ModeFamily:
-    """:func:`turning_family` of a specimen with rows that aren't staggered."""
+    """Make the :func:`turning_family` of a specimen with rows that aren't staggered."""
     a, b = specimen.cellular_half_size
     x0 = 0.0 if specimen.holes_x % 2 == 0 else a % specimen.pitch
     y0 = 0.0 if specimen.holes_y % 2 == 0 else b % specimen.row_distance
@@ -161,10 +161,10 @@ def rotation_family(specimen: Specimen) -> ModeFamily:
 
 
 def turning_family(vectors: FloatArray, cell_size: float, junction: ArrayLike) -> ModeFamily:
-    """Eq. (mode) on a lattice of right angles, ``vectors`` (2, 2) as rows, about a junction [mm].
+    """Make Eq. (mode) for a rectangular lattice, rows of ``vectors`` (2, 2), about a junction [mm].
 
-    The waves start with the lattice's own lengths, in units of pi over the cell size [mm], and a1
-    with the ratio of amplitudes by which junctions turn without changing shape.
+    The initial wave vectors are those of the lattice, in units of pi over the cell size [mm]; a1
+    starts as the ratio of amplitudes with which junctions rotate without changing shape.
     """
     first, second = np.linalg.inv(vectors / cell_size).T
     along, across = np.linalg.norm(vectors, axis=1)
@@ -178,13 +178,13 @@ d/l = 0.87 and 0.92 and five loadings (docs/explanation/families.md)."""
 
 
 def zone_boundary_families(specimen: Specimen) -> tuple[ModeFamily, ...]:
-    """Families of the modes at the three M points of a specimen's lattice of staggered rows.
+    """Make the mode families of the three M points of a specimen with staggered rows.
 
-    Each has a wave towards its M point, of mostly transverse motion, and one across, the shortest
-    that the lattice couples to it; both are zero at holes' centres (docs/explanation/families.md).
-    For a transverse amplitude of 1 of the first wave the parameters are L1, its longitudinal one,
-    T2, the second one's transverse one, the first one's wave vector, which the second one's turns
-    and grows with, and the phases.
+    Each has two waves: one towards its M point, mostly transverse, and one across, with the
+    shortest wave vector that the lattice couples to it. Both are zero at the holes' centres
+    (docs/explanation/families.md). The first wave's transverse amplitude is 1. The parameters are
+    L1, the first wave's longitudinal amplitude; T2, the second's transverse amplitude; the first
+    wave vector, with which the second rotates and scales; and the two phases.
     """
     reciprocal = 2.0 * specimen.pitch * np.linalg.inv(specimen.vectors).T  # of waves [pi/l]
     steps = np.array([(m, n) for m in range(-2, 3) for n in range(-2, 3)])
@@ -202,7 +202,7 @@ def zone_boundary_families(specimen: Specimen) -> tuple[ModeFamily, ...]:
 def _two_waves(name: str, first: FloatArray, second: FloatArray) -> ModeFamily:
     """Two waves of given wave vectors [pi/l], the second transverse, phases zero at the origin."""
     n, m = local_frame(first)
-    turn = np.column_stack([first, (-first[1], first[0])])  # times (1, 0) it is the first wave
+    turn = np.column_stack([first, (-first[1], first[0])])  # maps (1, 0) to the first wave
     turn = np.column_stack([second, (-second[1], second[0])]) @ np.linalg.inv(turn)
     matrix, offset = np.zeros((2, PER_WAVE, 6)), np.zeros((2, PER_WAVE))
     offset[0, :2] = m
@@ -217,7 +217,7 @@ def _two_waves(name: str, first: FloatArray, second: FloatArray) -> ModeFamily:
 def two_waves_near(parameters: ArrayLike, ideal: ArrayLike, half_wavelength: float) -> FloatArray:
     """(6,) equivalent parameters of :func:`zone_boundary_families`, phases nearest to the ideal.
 
-    A wave whose phase moves by l changes sign; that of the first is v's, of the second T2's.
+    Moving a wave's phase by l changes its sign: v takes up the first wave's, T2 the second's.
     """
     near, ideal = np.array(parameters, dtype=np.float64), np.asarray(ideal)
     turns = np.round((near[4:] - ideal[4:]) / half_wavelength)
@@ -227,7 +227,7 @@ def two_waves_near(parameters: ArrayLike, ideal: ArrayLike, half_wavelength: flo
 
 
 def local_frame(vector: FloatArray) -> FloatArray:
-    """(2, 2) rows: the direction of a vector, and that turned by +90 degrees."""
+    """(2, 2) rows: the direction of a vector, and that direction rotated by +90 degrees."""
     x, y = vector / np.linalg.norm(vector)
     return np.array([[x, y], [-y, x]])
 
@@ -237,14 +237,14 @@ FAMILIES: dict[str, Callable[[Specimen], tuple[ModeFamily, ...]]] = {
     "rectangular": lambda specimen: (rotation_family(specimen),),
     "triangular": zone_boundary_families,
 }
-"""The families of a specimen's modes, by its stacking."""
+"""Makers of the families of a specimen's modes, by its stacking."""
 
 
 def free_family(waves: ArrayLike) -> ModeFamily:
     """Make the family in which every wave has its own five parameters.
 
-    An amplitude common to all waves is what v_i already describes, so the largest amplitude of the
-    start, (w, 5) A, B, kx, ky, c, is fixed. Raises InputError if the waves are not of that shape.
+    v_i already describes an amplitude common to all waves. Therefore the largest amplitude of
+    ``waves``, (w, 5) initial A, B, kx, ky, c, is fixed. Raises InputError for any other shape.
     """
     full = np.atleast_2d(np.asarray(waves, dtype=np.float64))
     if full.ndim != 2 or full.shape[1] != PER_WAVE:
@@ -268,19 +268,19 @@ def free_family(waves: ArrayLike) -> ModeFamily:
 
 
 _LARGEST = 0.04
-"""Of ||phi|| [-]."""
+"""Maximum of ||phi|| [-]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FourierMode:
-    """A mode phi: a family, its length, its scale and its support."""
+    """A mode phi: a family, its half-wavelength, its scale and its support."""
 
     family: ModeFamily
-    """How the mode's parameters make its waves."""
+    """The map from the mode's parameters to its waves."""
     half_wavelength: float
     """l [mm], half the wavelength at k = 1; the paper takes the size of the unit cell."""
     scale: float
-    """s [-]."""
+    """The fixed scale s [-]."""
     taper: Taper
 
     def __post_init__(self) -> None:

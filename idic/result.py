@@ -1,6 +1,6 @@
 """The result of a correlation: unknowns, covariance, fields on demand, outcome; written as JSON.
 
-Null is infinity, or NaN.
+In the file, null stands for infinity or for NaN.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ FORMAT = "modeharvest-result-5"
 _BAND = 64
 """Rows that are warped back at a time, so that little memory is needed."""
 _MOST_NOISE = 0.8
-"""Of a mean square slope no more is taken for noise: where noise is all there is, the estimate of
-what is not would be nothing."""
+"""Largest share of a mean square slope that is attributed to noise: where noise is all there is,
+the estimate of the speckle's own slope would be zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """The (n, n) covariances of a result's unknowns by their causes."""
+    """The (n, n) covariances of a result's unknowns, by cause."""
 
     by_noise: FloatArray
-    """By the images' noise."""
+    """Due to the images' noise."""
     by_model_error: FloatArray | None
-    """By the residual, cell by cell; None where there are too few cells."""
+    """Due to model error, by the residual of each cell; None where there are too few cells."""
     warnings: tuple[str, ...] = ()
-    """Why, one sentence each."""
+    """Why a covariance is missing, one sentence each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +54,13 @@ class Result:
     ansatz: Ansatz
     """The kinematics."""
     grid: PixelGrid
-    """The pixels of the full images."""
+    """Pixel grid of the full-resolution images."""
     unknowns: FloatArray
     """(n,): a, in the order of ``ansatz.names``."""
     inverse: FloatArray
-    """(n, n) covariance of the unknowns for a residual of white noise of variance 1: with least
-    squares M^-1, M = J'J being the Gauss-Newton matrix; with other weights h in place of J (h'J)^-1
-    h'h (J'h)^-1. Infinite on the diagonal where nothing could be determined."""
+    """(n, n) covariance of the unknowns if the residual is white noise of variance 1. Least
+    squares: M^-1 with the Gauss-Newton matrix M = J'J. With other weights h in place of J: (h'J)^-1
+    h'h (J'h)^-1. Infinite on the diagonal for unknowns that couldn't be determined."""
     residual_rms: float
     """Root mean square of the residual over the pixels used: grey levels, or mm per component for a
     fit to a displacement."""
@@ -71,31 +71,31 @@ class Result:
     outcome: Outcome
     """Why the iteration ended, on the finest level."""
     condition_number: float
-    """Of the column-scaled Gauss-Newton matrix."""
+    """Condition number of the column-scaled Gauss-Newton matrix."""
     history: tuple[Iteration, ...] = ()
     """Every iteration of every level."""
     residual_correlation: float = float("nan")
     """Rms autocorrelation of the residual [-]: near 0 for noise; NaN for a fit to a displacement.
     See :meth:`residual_test`."""
     decorrelated_fraction: float = float("nan")
-    """Of the image, where f and g(x + u) have little to do with each other [-]; above 0.1 the
-    outcome is LOCAL_MINIMUM. NaN for a fit to a displacement."""
+    """Fraction of the image where f and g(x + u) are decorrelated [-]; above 0.1 the outcome is
+    LOCAL_MINIMUM. NaN for a fit to a displacement."""
     residual_lags_px: tuple[int, ...] = LAGS_PX
-    """How far apart the residual's autocorrelation was taken [px]."""
+    """Lags at which the residual's autocorrelation was taken [px]."""
     weighting: Weighting = field(default_factory=Weighting)
     """Which gradient weighed the residual."""
     slope_square: float = 0.0
     weight_square: float = 0.0
-    """Mean squares along an axis of the deformed image's gradient and of the one that weighed the
-    residual, noise included [grey levels^2/px^2]."""
+    """Mean squares, per axis, of the deformed image's gradient and of the gradient that weighed the
+    residual; both include noise [grey levels^2/px^2]."""
     noise_transfer: NoiseTransfer = field(default_factory=NoiseTransfer)
-    """What of the deformed image's noise reaches the residual."""
+    """How much of the deformed image's noise reaches the residual."""
     order: int = 5
-    """Of the spline."""
+    """Order of the spline that sampled the deformed image."""
     final_smoothing: FinalSmoothing | None = None
-    """Of the images on the finest level; None where there was none to choose."""
+    """Smoothing of the images on the finest level; None where none was specified or chosen."""
     errors: Covariance | None = None
-    """Where they were found, such as by a harvest; :meth:`covariance` is of noise alone."""
+    """Covariances by cause, if computed, as by a harvest; :meth:`covariance` is of noise alone."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
@@ -119,22 +119,22 @@ class Result:
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Names of the unknowns that the images say nothing about."""
+        """Names of the unknowns that the images don't determine."""
         lost = np.isinf(np.diag(self.inverse))
         return tuple(name for name, is_lost in zip(self.names, lost, strict=True) if is_lost)
 
     @property
     def model_error_px(self) -> float:
-        """Estimate, rms per component: residual over rms gradient [px of :attr:`grid`]."""
+        """Estimated model error: residual over gradient, rms per component [px of :attr:`grid`]."""
         gradient = np.sqrt(2.0 * self.slope_square)
         return float(self.residual_rms / gradient) if gradient else np.inf
 
     @property
     def noise_sd(self) -> float:
-        """Grey-level noise of each image if the residual were nothing but noise, alike in both.
+        """Standard deviation of each image's noise if the residual is only noise [grey levels].
 
-        An upper bound: what the ansatz can't describe is in the residual too. What the spline
-        smooths away of the noise of g is not in it, and is put back.
+        An upper bound, because the residual also contains what the ansatz can't describe. The
+        estimate accounts for the part of g's noise that the spline smooths away.
         """
         freedom = max(1, self.pixels - self.ansatz.size)
         both = 1.0 + self.noise_transfer.value
@@ -142,7 +142,7 @@ class Result:
 
     @property
     def noise_to_slope(self) -> float:
-        """Variance of :attr:`noise_sd` over the mean square of the speckle's own slope [px^2]."""
+        """:attr:`noise_sd` squared over the mean square of the noise-free speckle slope [px^2]."""
         if self.slope_square <= 0.0:
             return 0.0
         variance = self.noise_sd**2
@@ -152,15 +152,15 @@ class Result:
     def covariance(self, noise: ImageNoise | float | None = None) -> FloatArray:
         """(n, n) covariance of the unknowns under white noise: for weak noise the Cramer-Rao bound.
 
-        The noise is that of the images, or the standard deviation of both [grey levels]; by default
-        :attr:`noise_sd` in both, which makes the residual nothing but noise.
+        ``noise``: of the images, or one standard deviation for both [grey levels]; by default
+        :attr:`noise_sd` in both, which attributes the whole residual to noise.
 
-        s_f^2 + s_g^2/det F, the mean of 1/det F over the pixels, times :attr:`inverse`. Of higher
-        order are two things that noise in the gradient does. The noise of an image is uncorrelated
-        with its own slope at the same pixel and anticorrelated elsewhere, which takes back what
-        that slope seems to scatter. And J'J holds the slope of g's noise: where it is the matrix
-        (least squares), that is taken out. Where the noise isn't given, these are counted if the
-        residual is noise.
+        It is :attr:`inverse` times s_f^2 + s_g^2/det F, with the mean of 1/det F over the pixels,
+        and with two corrections of higher order for noise in the gradient. First, the noise of an
+        image is uncorrelated with its own slope at the same pixel and anticorrelated elsewhere,
+        which takes back the scatter that this slope seems to cause. Second, J'J contains the slope
+        of g's noise; with least squares, where J'J is the matrix, that part is removed. If no noise
+        is given, the corrections are applied only where the residual is noise.
         """
         known = ImageNoise.of(self.noise_sd if noise is None else noise)
         in_f = known.reference**2
@@ -176,7 +176,7 @@ class Result:
         return np.asarray(variance * self.inverse)
 
     def noise_in_slope(self, noise: ImageNoise) -> float:
-        """Share of :attr:`weight_square` that is the noise's [-]."""
+        """Share of :attr:`weight_square` that is due to noise [-]."""
         if self.weight_square <= 0.0:
             return 0.0
         weighting = self.weighting
@@ -190,15 +190,15 @@ class Result:
         return min(made / self.weight_square, _MOST_NOISE)
 
     def residual_noise(self, noise: ImageNoise | float) -> float:
-        """Standard deviation of the residual that noise in the images makes [grey levels]."""
+        """Standard deviation of the residual due to noise in the images [grey levels]."""
         known = ImageNoise.of(noise)
         in_g = self.noise_transfer.value * known.deformed**2
         return float(np.sqrt(known.reference**2 + in_g))
 
     def residual_test(self, noise: ImageNoise | float | None = None) -> ResidualTest:
-        """Whether the residual is noise: what the standard errors rest on.
+        """Test whether the residual is noise, as the standard errors assume.
 
-        With the images' noise, or the standard deviation of both [grey levels], chi squared, too.
+        Given the images' noise, or one standard deviation for both [grey levels], also chi squared.
         """
         return ResidualTest.of(
             self.residual_rms, self.residual_correlation, self.pixels, self.ansatz.size, None if
@@ -234,10 +234,10 @@ class Result:
         return self.ansatz.fluctuation(i, self.unknowns, *_axes(grid or self.grid))
 
     def residual(self, pair: ImagePair, order: int = 5) -> FloatArray:
-        """(rows, cols): f - g(x + u) [grey levels] in the reference frame; NaN off the image.
+        """(rows, cols): f - g(x + u) [grey levels] in the reference frame; NaN outside the image.
 
-        Of a pair on :attr:`grid`; gain and offset are applied to g if they were unknowns. The order
-        is the spline's.
+        The pair must be on :attr:`grid`; gain and offset are applied to g if they were unknowns.
+        ``order`` is that of the spline.
         """
         if pair.grid.shape != self.grid.shape:
             raise InputError(f"expected images of {self.grid.shape} px, got {pair.grid.shape}")
@@ -247,9 +247,9 @@ class Result:
     def warped_back(
         self, deformed: SplineImage, known: FloatArray | None = None
     ) -> Iterator[FloatArray]:
-        """(1 + b) g(x + u) + c in the reference frame, some rows at a time; NaN off the image.
+        """(1 + b) g(x + u) + c in the reference frame, a band of rows at a time; NaN outside g.
 
-        ``known``: (rows, cols, 2) u [mm], NaN where it isn't, instead of the ansatz' own.
+        ``known``: (rows, cols, 2) u [mm] used instead of the ansatz' own; NaN where unknown.
         """
         grid, row, col = self.grid, np.arange(self.grid.rows)[:, None], np.arange(self.grid.cols)
         for first in range(0, grid.rows, _BAND):
@@ -263,19 +263,19 @@ class Result:
             yield gain * value + offset
 
     def write(self, path: Path | str) -> None:
-        """Write JSON, atomically; every number comes back as it was."""
+        """Write JSON, atomically; reading it gives every number exactly."""
         write_json(path, {"format": FORMAT, **result_to_dict(self)})
 
     @classmethod
     def read(cls, path: Path | str) -> Result:
-        """Read what :meth:`write` wrote; raises InputError of a missing, cut or foreign file."""
+        """Read what :meth:`write` wrote; InputError for a missing, truncated or foreign file."""
         what, remedy = f"a complete {FORMAT} file", "correlate again"
         with reading(path, what, remedy):
             return cls(**result_fields(read_record(path, FORMAT, what, remedy)))
 
 
 def determined_part(matrix: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """A covariance with zeros for what is undetermined, and (n,) what that is."""
+    """Return a covariance with zeros for undetermined unknowns, and (n,) which ones those are."""
     lost = np.isinf(np.diag(matrix))
     return np.where(lost[:, None] | lost[None, :], 0.0, matrix), lost
 
@@ -285,7 +285,7 @@ def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
 
 
 def result_to_dict(result: Result) -> dict[str, Any]:
-    """Everything a result holds but its timings, and what it means in words."""
+    """Convert a result to plain JSON values, with explanations in words."""
     content: dict[str, Any] = {name: to_plain(getattr(result, name)) for name in _STORED}
     weighting = result.weighting
     content["weighting"] |= {"gradient": weighting.gradient.value, "explanation": weighting.text}
@@ -298,8 +298,8 @@ def result_to_dict(result: Result) -> dict[str, Any]:
 
 
 def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Make the arguments of the result that :func:`result_to_dict` described."""
-    content = {"errors": None, **content}  # not there in older files
+    """Make the arguments of :class:`Result` from what :func:`result_to_dict` returned."""
+    content = {"errors": None, **content}  # missing in older files
     numbers = {name: _or(np.nan if name in _UNKNOWN else np.inf, content[name]) for name in _STORED}
     how, smoothing, errors = (content[k] for k in ("weighting", "final_smoothing", "errors"))
     size_px, is_low_pass = _or(np.inf, how["speckle_size_px"]), bool(how.get("low_pass"))
@@ -329,7 +329,7 @@ def _matrix(rows: list[list[float | None]] | None) -> Any:
 
 _STORED = tuple(f.name for f in fields(Result))
 _UNKNOWN = ("residual_correlation", "decorrelated_fraction")
-"""Null is NaN there, and infinity elsewhere."""
+"""Fields in which null stands for NaN; elsewhere it stands for infinity."""
 
 
 def _or(missing: float, value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Options of a measurement: the ansatz, how to correlate, the tables of experiments' files."""
+"""Options of a measurement: the ansatz, the correlation, and the tables of experiments' files."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ FORMULATIONS = ("total", "updated")
 
 @dataclass(frozen=True)
 class CorrelationOptions:
-    """How to correlate."""
+    """Options of a correlation: levels, pixels left out, spline, tolerances, weights, smoothing."""
 
     levels: tuple[Level, ...] = COARSE_TO_FINE
-    """From coarse to fine. Levels that would blur a mode away (a blur above a quarter of l) or
-    leave fewer than 32 px across are skipped; the last one never is."""
+    """Levels from coarse to fine. Those that would blur a mode away (a blur above a quarter of l)
+    or leave fewer than 32 px across are skipped, except the last one."""
     edge_px: int = 2
     """Pixels of f closer than this to a hole's edge are left out on the finest level [px]."""
     order: int | None = None
-    """Of the spline that samples the deformed image: 3, 5 or 11. By default 5, or 11 where speckles
-    are narrower than 6.5 px: those a quintic displaces by up to 2e-3 px."""
+    """Order of the spline that samples the deformed image: 3, 5 or 11. By default 5, or 11 for
+    speckles narrower than 6.5 px, which a quintic spline displaces by up to 2e-3 px."""
     gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
-    """Tolerances and limits."""
+    """Tolerances and limits of the Gauss-Newton iteration."""
     gradient: str | None = None
-    """What weighs the residual in the end, see :mod:`modeharvest.idic.solver.weighting`: the
-    gradient of the "deformed" image at x + u (the least-squares minimum), or that of the
-    "reference" at x. By default the latter where the residual is noise, else the former."""
+    """Gradient that weighs the residual in the end, see :mod:`modeharvest.idic.solver.weighting`:
+    that of the "deformed" image at x + u (the least-squares minimum), or that of the "reference" at
+    x. By default "reference" where the residual is noise, else "deformed"."""
     gradient_blur_px: float | None = None
-    """Blur of the image that this gradient is taken of, on the finest level [px]. By default none,
-    unless the residual is noise: then the blur that makes the unknowns' variance smallest."""
+    """Blur of the image before this gradient is taken, on the finest level [px]. By default none,
+    or where the residual is noise, the blur that minimises the variance of the unknowns."""
     final_smoothing_px: float | None = 0.0
-    """Blur of both images, locally normalised [px]; None for as the model error on the last coarse
-    level asks for, which is how photographs are correlated, and then on the finest level alone. See
-    :mod:`modeharvest.idic.solver.final_smoothing`."""
+    """Blur of both images, which are locally normalised too [px]. None chooses it from the model
+    error on the last coarse level, as for photographs, and applies it on the finest level alone.
+    See :mod:`modeharvest.idic.solver.final_smoothing`."""
 
     def __post_init__(self) -> None:
         known = [gradient.value for gradient in Gradient]
@@ -69,15 +69,15 @@ class PhotographOptions(AnsatzOptions):
     """Table ``[correlation]`` of an experiment with photographs."""
 
     family: str = "auto"
-    """Of modes: "auto" reads them off the spectrum; "square" is the paper's Eq. (mode)."""
+    """Mode family: "auto" reads the modes off the spectrum; "square" is the paper's Eq. (mode)."""
     fixed_mode: bool | str = "auto"
-    """Keep phi1 as it is found at first; "auto" does so where no pattern is observable."""
+    """Keep phi1 as initially found; "auto" does so where no pattern is observable."""
     edge_px: int = 3
     order: int | None = None
     """As in :class:`CorrelationOptions`."""
     formulation: str = "total"
-    """Images are measured against the reference ("total") or each against the one before, pulled
-    back to the reference's frame ("updated"): for speckles that change on the way."""
+    """Each image is correlated with the reference ("total"), or with the previous image, pulled
+    back to the reference's frame ("updated"): for speckles that change during the experiment."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,18 +106,18 @@ class SquareLatticeOptions(AnsatzOptions):
     """Table ``[correlation]`` of a virtual experiment.
 
     The defaults are the paper's (section "Virtual Experiments"): in square stacking 42 + 28
-    unknowns of v0 and v1, and the mode's 7 make 77. Those without a word are as in
+    unknowns of v0 and v1, and the mode's 7 make 77. Options without a description are as in
     :class:`CorrelationOptions`.
     """
 
     start_amplitude: float = 1.0
-    """The constant that v1 starts with [mm]; with max ||phi|| = 0.04, 1 mm is a 40 um pattern."""
+    """Initial constant value of v1 [mm], not 0; with max ||phi|| = 0.04, 1 mm gives 40 um."""
     edge_px: int = 2
     order: int | None = None
     camera: bool = False
     """Correlate the quantised images instead of the float ones."""
     fixed_mode: bool = False
-    """Keep phi1 at the ideal pattern, for images without a pattern to find it from."""
+    """Keep phi1 fixed at the ideal pattern; for images that show no pattern to find it from."""
     gradient: str | None = None
     gradient_blur_px: float | None = None
 

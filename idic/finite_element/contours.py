@@ -1,23 +1,23 @@
-"""The displacement of a body whose contours alone are seen: a hyperelastic mesh held to them.
+"""Displacement of a body from its contours alone: a hyperelastic mesh tied to them by springs.
 
-A surface without speckle shows where its material ends, and nothing inside or along an edge. What
-is missing there is mechanics: sought is the displacement u of least
+A surface without speckle shows where its material ends, but nothing inside or along an edge.
+Mechanics supplies what is missing there. The displacement u that is sought minimises
 
     int W(I + grad u) dA + k/2 int d(X + u)^2 dS,
 
-W the energy density of a law, d the signed distance to the contour of the deformed image, less what
-the mesh's own edge is off the contour of the reference. Springs k are stiff, so that the contours
-decide; where the law is right free edges have no traction, and the springs carry nothing. What a
-wrong law does is therefore small, and estimated: by how much laws of other compressibility change
-u. An edge that is straight and stays so is taken to be held by a plate on which it doesn't slide.
-Contours don't show whether it does; what sliding would change counts in the standard deviation.
-Dots on the material hold it where their centres are, by springs as stiff as those along a contour
-of half their circumference: a circle's centre is as well known as that, in each direction.
+W is the energy density of the material law, and d the signed distance to the contour of the
+deformed image, less that of the mesh's own edge to the contour of the reference. The springs k are
+stiff, so that the contours decide. With the right law, free edges have no traction and the springs
+carry nothing; a wrong law therefore has little effect, which is estimated by how much laws of other
+compressibility change u. A straight edge that stays straight is taken to be held by a plate without
+sliding. Contours don't show sliding; what it would change counts in the standard deviation. Dots on
+the material are tied at their centres, by springs as stiff as those along a contour of half their
+circumference: a circle's centre is as well known as that, in each direction.
 
-Where an image's border cuts the body, unknown tractions hold it. Over each ligament that is cut, or
-piece of one cut lengthwise, they have two resultants and a moment, which are found as those with
-which the springs carry least. Other tractions there matter nearby (Saint-Venant), and count in the
-standard deviation as if they were as large as stress in the body is.
+Where an image's border cuts the body, unknown tractions act. On each cut ligament, or piece of a
+ligament cut lengthwise, they have two resultants and a moment, which are chosen such that the
+springs carry least. Other tractions there matter nearby only (Saint-Venant), and count in the
+standard deviation as if they were as large as the stress in the body.
 """
 
 from __future__ import annotations
@@ -46,31 +46,31 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
 ELASTOMER = Ogden(moduli=(2.0,), exponents=(2.0,), kappa=9.0)
-"""Neo-Hookean, Poisson's ratio 0.45: what is assumed of a body whose law isn't known."""
+"""Neo-Hookean law, Poisson's ratio 0.45, which is assumed where a body's law isn't known."""
 _SOFTER, _STIFFER = 7.0 / 3.0, 49.0
-"""Volumetric constants, over the shear modulus, of Poisson's ratios 0.35 and 0.49."""
+"""Volumetric constants, over the shear modulus, for Poisson's ratios 0.35 and 0.49."""
 _SPRINGS = (0.5, 5.0)
-"""Stiffness of the springs, in turn [shear modulus/px]."""
+"""Stiffnesses of the springs, used one after the other [shear modulus/px]."""
 _PLATE = 1e6
 """Stiffness along edges that don't slide [shear modulus times px]."""
 _FAR_PX = 3.0
-"""The mesh's edge is off the contour of the reference by less, or that contour is not known."""
+"""Points of the mesh's edge farther than this from the reference's contour aren't tied to it."""
 _CUT_PX = 5.0
-"""Sides of elements nearer to the image's border are cut by it: masks are rounded off there."""
+"""Element sides nearer than this to the image's border are cut by it: masks are rounded there."""
 _TURNED = 0.3
-"""Cosine of the angle between an edge's normals in both images, at least."""
+"""Least cosine of the angle between an edge's normals in both images."""
 _MOST_SIDES = 4
-"""Of elements in one piece of a cut, whose tractions have two resultants and a moment."""
+"""Most element sides in one piece of a cut, whose tractions have two resultants and a moment."""
 _RIDGE = 3.0
 """Weight of tractions, over stress, in variances of the contours' noise [-]; found by trial."""
 _ROUNDS, _LONGEST_PX = 3, 8.0
-"""Of the tractions at cut sides, and what they move a node by in one step, at most."""
+"""Iterations for the tractions at cut sides, and how far one may move a node at most."""
 _CORNER = np.deg2rad(35.0)
 _LEAST_SIDE, _STRAIGHT, _STAYS_STRAIGHT = 0.2, 2e-3, 5e-3
-"""Length of a straight edge over that of the body, at least, and how far off a straight line it
-may be over its own length, rms, in the reference and in the deformed image."""
+"""Least length of a straight edge over that of the body; largest rms deviation from a straight
+line, over the edge's length, in the reference and in the deformed image."""
 _LOADED = 0.3
-"""Mean traction of an edge that is held over the largest of all straight ones, at least."""
+"""Least mean traction of an edge held by a plate, over the largest of all straight edges."""
 _GAUSS, _WEIGHTS = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6), np.array([5, 8, 5]) / 18.0
 _ROUGH_PX, _TOLERANCE_PX, _STEPS = 1.0, 0.01, 60
 _LEAST_DET = 0.02
@@ -80,22 +80,22 @@ _ASTRAY = (
     "more pixels across notches and slits."
 )
 _UNEXPLAINED_PX = 0.05
-"""Distance from contours beyond their noise, rms, that a picture of grey levels doesn't have."""
+"""Rms distance from contours, beyond their noise, that shows that pictures are thresholded."""
 _STEP_PX, STEPS_PX3 = 1.0 / np.sqrt(6.0), 0.6765**2 / np.pi
-"""Two thresholded pictures: standard deviation of where a straight edge is, rectangular in each;
-and variance of a hole's edge times length [px^3], whose area is known to 0.6765 sqrt(radius) in
-each: M. G. Kendall, Q. J. Math. 19 (1948) 1."""
+"""Of two thresholded pictures: standard deviation of a straight edge's position, rectangular in
+each, and variance of a hole's edge times its length [px^3], as the hole's area is known to 0.6765
+sqrt(radius) in each: M. G. Kendall, Q. J. Math. 19 (1948) 1."""
 _STEPPED = (
     "Contours are met within {:.2f} px, of which noise explains {:.2f} px: thresholded pictures, "
     "or a body far from the assumed law. Standard deviations are those of thresholded pictures."
 )
 _TRIANGULAR, _RECTANGULAR = 6.0, 3.0
-"""Half-width squared over variance of such distributions: of what is most likely in the middle, and
-of what is as likely anywhere; JCGM 100, 4.3.7 and 4.3.9."""
+"""Half-width squared over variance of a triangular distribution (most likely in the middle), and of
+a rectangular one (equally likely everywhere); JCGM 100, 4.3.7 and 4.3.9."""
 
 
 class _Edge:
-    """The points of a mesh's edge that are held to contours, and dots, in two directions each."""
+    """Points of a mesh's edge, tied to contours, and dots, tied in two directions each."""
 
     def __init__(self, mesh: Mesh, seen: SeenContours, grid: PixelGrid) -> None:
         t, pixel_size = _GAUSS, grid.pixel_size
@@ -117,16 +117,16 @@ class _Edge:
         self.off, self.normal, beyond = Contours(seen.reference).distance(self.points, self.number)
         self.off[beyond] = 0.0
         self.cut = np.where(seen.is_part, _cut_ligaments(mesh, sides, grid), -1).repeat(t.size)
-        """(q,) number of the ligament that the image's border cuts, from 0; -1 elsewhere."""
+        """(q,) number, from 0, of the ligament that the image's border cuts; -1 elsewhere."""
         self.whole_length = self.length.copy()
         self.is_tied = (np.abs(self.off) < _FAR_PX * pixel_size) & (self.cut < 0)
-        """(q,) whether a point of the edge is held."""
+        """(q,) whether a point of the edge is tied to a contour."""
         self.has_left = np.zeros(len(self.points), dtype=np.bool_)
-        """(q,) whether it isn't on its contour in the deformed image any more: see :meth:`look`."""
+        """(q,) whether a point has left its contour in the deformed image, see :meth:`look`."""
         dots = np.array([[c.moments[1] for c in pair] for pair in seen.dots]).reshape(-1, 2, 2)
         half = np.array([0.5 * contour.length for contour, _ in seen.dots])
         self.length = np.append(np.where(self.is_tied, self.length, 0.0), half.repeat(2))
-        """(q + 2 p,) that each spring stands for [mm]: along the edge, then of p dots in x, y."""
+        """(q + 2 p,) length that a spring represents [mm]: q on the edge, p dots along x and y."""
         self.dots_moved = dots[:, 1] - dots[:, 0]
         element, xi = located(mesh, dots[:, 0], True)
         own, size = mesh.cells[element], (len(dots), len(mesh.nodes))
@@ -142,7 +142,7 @@ class _Edge:
         return np.asarray(self.shapes.T @ parts).reshape(2 * self.shapes.shape[1], -1)
 
     def on_cuts(self) -> tuple[FloatArray, FloatArray]:
-        """(q, 2, 3 c) tractions on c cut ligaments: their forces and moments, and uneven ones."""
+        """Tractions (q, 2, 3 c) on c cut ligaments: their forces and moments, and uneven ones."""
         c = int(self.cut.max()) + 1
         own, other = (np.zeros((len(self.points), 2, 3 * c)) for _ in range(2))
         for k in range(c):
@@ -165,9 +165,9 @@ class _Edge:
         return np.isin(self.shapes.indices.reshape(-1, 3)[:, 1], side)
 
     def look(self, u: FloatArray) -> None:
-        """See which points have left the image at displacements (n, 2).
+        """Find which points have left the image at displacements (n, 2).
 
-        They are beyond the end of a contour that is cut, or nearest to a part that goes elsewhere.
+        Those are beyond the end of a cut contour, or nearest to a part of it with another normal.
         """
         x, is_cut = self.points + self.shapes @ u, self.deformed.is_cut[self.number]
         _, normal, beyond = self.deformed.distance(x, self.number)
@@ -177,8 +177,8 @@ class _Edge:
     def distances(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(q + 2 p,) signed distances [mm] at displacements (n, 2), (q + 2 p, 2) their gradients.
 
-        Both are 0 where a point had left the image: from iteration to iteration energies would jump
-        if that changed.
+        Both are 0 where :meth:`look` found that a point has left the image; if that changed from
+        iteration to iteration, the energy would jump.
         """
         d, normal, _ = self.deformed.distance(self.points + self.shapes @ u, self.number)
         d = np.where(self.has_left, 0.0, d - self.off)
@@ -188,7 +188,7 @@ class _Edge:
         return np.append(d, off.ravel()), np.vstack([normal, along])
 
     def normal_shapes(self, normal: FloatArray) -> csr_array:
-        """(q + 2 p, 2 n) what displacements are along the normals (q + 2 p, 2)."""
+        """Matrix (q + 2 p, 2 n) from displacements to components along normals (q + 2 p, 2)."""
         shapes = self._springs
         data = shapes.data[:, None] * normal.repeat(np.diff(shapes.indptr), axis=0)
         cols = 2 * shapes.indices[:, None] + np.arange(2)
@@ -198,7 +198,7 @@ class _Edge:
 
 
 def _cut_ligaments(mesh: Mesh, sides: IntArray, grid: PixelGrid) -> IntArray:
-    """(s,) which cut of a ligament each side (s, 3) of the mesh's edge is part of; -1 of none."""
+    """(s,) number of the cut ligament that a side (s, 3) of the mesh's edge is on; -1 for none."""
     left, right, bottom, top = grid.extent
     x, y = mesh.nodes[sides[:, 1]].T
     from_borders = np.array([x - left, right - x, y - bottom, top - y])
@@ -217,7 +217,7 @@ def _cut_ligaments(mesh: Mesh, sides: IntArray, grid: PixelGrid) -> IntArray:
 
 
 def straight_sides(mesh: Mesh) -> tuple[IntArray, ...]:
-    """Straight edges of a mesh between its corners: nodes of each, (k,), one after the other."""
+    """Straight edges of a mesh between its corners: the nodes (k,) of each, in order along it."""
     sides = boundary_sides(mesh)
     after, found = dict(zip(sides[:, 0], sides, strict=True)), []
     size = float(np.ptp(mesh.nodes, axis=0).max())
@@ -250,7 +250,7 @@ def _bend(x: FloatArray) -> float:
 
 
 class _PenalisedBody:
-    """A hyperelastic mesh held to contours, on its way to least energy."""
+    """A hyperelastic mesh tied to contours: the state of the energy's minimisation."""
 
     def __init__(
         self, body: Body, seen: SeenContours, grid: PixelGrid, law: Material, start: FloatArray
@@ -266,7 +266,7 @@ class _PenalisedBody:
         self.stiffness = 0.0
         own, other = self.edge.on_cuts()
         self.loads, self.uneven = self.edge.loads(own), self.edge.loads(other)
-        """(2 n, 3 c) forces of tractions of 1 at cuts [mm]: of their resultants, and of others."""
+        """(2 n, 3 c) nodal forces of unit tractions at cuts [mm]: resultants, and uneven ones."""
         self.tractions: FloatArray = np.zeros(own.shape[2])
         self.plates = csr_array((0, self.u.size))
         self.stretched: FloatArray = np.zeros(0)
@@ -275,16 +275,16 @@ class _PenalisedBody:
         self._stored = 0
 
     def _use(self, law: Material) -> None:
-        """Take a law, with its moduli over the shear modulus."""
+        """Set the material law, and the shear modulus mu that energies and forces are over."""
         self.law = Imbalance(self.mesh, law, self._none)
         self.shear = float(stress_and_tangent(law, np.eye(2)[None])[1][0, 0, 1, 0, 1])
 
     def distances(self) -> tuple[FloatArray, FloatArray]:
-        """Of edges and dots from where they are seen, and their gradients, as they are now."""
+        """Distances of edges and dots from where they are seen, at the present u; gradients."""
         return self.edge.distances(self.u.reshape(-1, 2))
 
     def energy(self, u: FloatArray) -> float:
-        """Of the body and its springs [N/mm times mm]; infinite where it is turned inside out."""
+        """Energy of the body and its springs, over mu [mm^2]; infinite where it is inverted."""
         F = self.law.deformation_gradient(u)
         if np.linalg.det(F).min() < _LEAST_DET:
             return np.inf
@@ -297,7 +297,7 @@ class _PenalisedBody:
         return own / self.shear + 0.5 * (springs + float(plates @ plates)) - work
 
     def linearised(self) -> tuple[csr_array, csr_array, FloatArray]:
-        """(2 n, 2 n) tangent stiffness, that of the springs in it, (2 n,) forces, all over mu."""
+        """(2 n, 2 n) tangent stiffness, the springs' part of it, and (2 n,) forces, all over mu."""
         f, K = self.law.forces(self.u)
         d, normal = self.distances()
         B = self.edge.normal_shapes(normal)
@@ -308,7 +308,7 @@ class _PenalisedBody:
         return csr_array(K / self.shear + springs + D.T @ D), springs, forces
 
     def factor(self, A: csr_array) -> Factor:
-        """Factorise, the order of elimination kept; ArithmeticError if it is singular."""
+        """Factorise A, keeping the order of elimination; ArithmeticError if A is singular."""
         A.sort_indices()
         if self._factor is None or self._stored != A.nnz:
             self._factor, self._stored = factorise(A, block=2), A.nnz
@@ -317,7 +317,7 @@ class _PenalisedBody:
         return self._factor
 
     def relax(self, springs: float, tolerance_px: float) -> bool:
-        """Newton's method, safeguarded as Levenberg's; springs in mu/px. Whether it converged."""
+        """Newton's method with Levenberg's damping; springs in mu/px. True if it converged."""
         self.stiffness = springs / self.px
         self.edge.look(self.u.reshape(-1, 2))
         energy, damping, safe = self.energy(self.u), 1e-3, self._first / self.shear
@@ -333,7 +333,7 @@ class _PenalisedBody:
                     break
                 damping *= 5.0
             longest = float(np.linalg.norm(step.reshape(-1, 2), axis=1).max()) / self.px
-            if there >= energy:  # to rounding, or astray
+            if there >= energy:  # converged to rounding, or failed
                 return bool(longest * (1.0 + damping) < _ROUGH_PX)
             self.u, energy = self.u + step, there
             if longest * (1.0 + damping) < tolerance_px:
@@ -342,7 +342,7 @@ class _PenalisedBody:
         return False
 
     def settle(self, springs: float, tolerance_px: float) -> bool:
-        """Relax, and find the tractions at cuts with which the springs carry least."""
+        """Relax, and choose the tractions at cuts such that the springs carry least."""
         converged = self.relax(springs, tolerance_px)
         for _ in range(_ROUNDS if self.tractions.size else 0):
             A, _, _ = self.linearised()
@@ -358,10 +358,10 @@ class _PenalisedBody:
         return converged
 
     def answers(self, factor: Factor, normal: FloatArray) -> tuple[FloatArray, ...]:
-        """(2 n, 3 c) u by tractions at cuts; (3 c, q) how these follow from distances; (3 c, 3 c).
+        """(2 n, 3 c) u by unit tractions at cuts; (3 c, q) tractions by distances; (3 c, 3 c).
 
-        The last is what is left of tractions that contours don't show: as large as stress is (rms),
-        these are as likely as distances as large as their noise.
+        The last is the part of the tractions that contours don't show: tractions as large as the
+        rms stress are taken to be as likely as distances as large as their noise.
         """
         by_tractions = factor.solve(self.loads)
         D = self.edge.normal_shapes(normal) @ by_tractions
@@ -378,7 +378,7 @@ class _PenalisedBody:
         return float(np.sqrt(np.average((P**2).mean(axis=(1, 2)), weights=weights)))
 
     def pressed_sides(self) -> tuple[IntArray, ...]:
-        """The straight edges that something presses or pulls."""
+        """The straight edges on which something presses or pulls: nodes (k,) of each."""
         d, normal = (part[: len(self.edge.points)] for part in self.distances())
         seen = self.edge.points + self.edge.shapes @ self.u.reshape(-1, 2) - d[:, None] * normal
         sides, tractions = [], []
@@ -392,7 +392,7 @@ class _PenalisedBody:
         return tuple(s for s, t in zip(sides, tractions, strict=True) if t > _LOADED * most)
 
     def press(self, sides: Sequence[IntArray], *, slides: bool) -> None:
-        """Let plates press straight edges, which keep their length unless they slide."""
+        """Let plates press on straight edges, which keep their length unless they slide."""
         self.pressed = [self.edge.on(nodes) & self.edge.is_tied for nodes in sides]
         if slides or not sides:
             return
@@ -411,13 +411,13 @@ class _PenalisedBody:
         self.stretched = root * ((along * gaps).sum(axis=1) - length)
 
     def take_up(self, stiffer: float) -> None:
-        """Take up by how much springs give way under plates once they are so many times stiffer."""
+        """Compensate how much springs yield under plates, once ``stiffer`` times as stiff."""
         d = self.distances()[0][: len(self.edge.points)]
         for own in self.pressed:
             self.edge.off[own] -= np.average(d[own], weights=self.edge.whole_length[own]) / stiffer
 
     def change_by(self, law: Material | None = None, slides: bool = False) -> FloatArray:
-        """(n, 2) by how much another law, or edges that slide, would change u [mm], about."""
+        """(n, 2) estimated change of u by another law, or by edges that slide [mm]."""
         other = copy(self)
         if law is not None:
             other._use(law)
@@ -430,9 +430,9 @@ class _PenalisedBody:
     def with_tractions(
         self, u: FloatArray, factor: Factor, noise: FloatArray | float = 0.0
     ) -> FloatArray:
-        """(2 n, k) changes u with those of the tractions at cuts that follow from them.
+        """(2 n, k) changes ``u``, with those by the tractions at cuts that follow from them.
 
-        ``noise`` (q, k): of the contours' distances, beside what u changes them by [mm].
+        ``noise`` (q, k): of the contours' distances, apart from their change by ``u`` [mm].
         """
         if not self.tractions.size:
             return u
@@ -442,7 +442,7 @@ class _PenalisedBody:
         return np.asarray(u + by_tractions @ (answer @ off))
 
     def by_other_tractions(self, factor: Factor, count: int) -> FloatArray:
-        """(n, 2, count) what random tractions at cuts do, uneven or not shown by contours."""
+        """(n, 2, count) u by random tractions at cuts, uneven or not shown by contours."""
         _, normal = self.distances()
         by_tractions, answer, kept = self.answers(factor, normal)
         shape = 2, self.tractions.size, count
@@ -458,16 +458,16 @@ def displacement_from_contours(
 ) -> NodalResult:  # fmt: skip
     """Find the displacement of a body from the contours of its edges.
 
-    InputError if no contour is at the mesh's edge, or they don't hold the body.
+    InputError if no contour is at the mesh's edge, or the contours don't hold the body.
 
     seen : contours in the reference and in the deformed image [mm].
     body : T6 mesh of the material in the reference.
     grid : pixels of the images.
-    start : (n, 2) displacement [mm] within which each contour is nearer to its own than half a
-        hole; an affine motion will do.
-    law : of the body, in plane strain; by default :data:`ELASTOMER`. A factor doesn't matter.
-    slides : whether edges slide on plates, which isn't seen; by default they don't.
-    progress : listener.
+    start : (n, 2) initial displacement [mm], with which each contour is nearer than half a hole to
+        its counterpart in the deformed image; an affine motion will do.
+    law : material law of the body, in plane strain; by default :data:`ELASTOMER`. Scale-free.
+    slides : whether edges slide on plates, which contours don't show; by default they don't.
+    progress : progress listener.
     """
     state = _PenalisedBody(body, seen, grid, law or ELASTOMER, start)
     soft, stiff = _SPRINGS
@@ -520,7 +520,7 @@ def displacement_from_contours(
 def _deviations(
     state: _PenalisedBody, law_is_assumed: bool, may_slide: bool, is_stepped: bool, left: FloatArray
 ) -> tuple[Deviations, float]:
-    """Standard deviations by noise, law, plates, springs; how many unknowns contours determine."""
+    """Standard deviations due to noise, law, plates and springs; effective number of unknowns."""
     mesh, edge, rng = state.mesh, state.edge, np.random.default_rng(0)
     A, springs, _ = state.linearised()
     _, normal = state.distances()

@@ -1,7 +1,7 @@
-"""Strains and stresses that follow from a deformation gradient: one table of names and units.
+"""Strains and stresses computed from a deformation gradient: one table of names and units.
 
-Standard deviations are those of F carried over: D C D', with the covariance C of the four
-components of F and the derivatives D of a field by central differences.
+Variances are propagated from F as D C D', with the covariance C of the four components of F and the
+derivatives D of a field by central differences.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.typed import nearest
 
 _STEP = 1e-6
-"""Of the components of F, in central differences [-]."""
+"""Step of the components of F in central differences [-]."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """What follows from F (k, 2, 2), and for stresses from a material: (k,), (k, 2), (k, 2, 2)."""
+    """A field computed from F (k, 2, 2), and for stresses a material: (k,), (k, 2), (k, 2, 2)."""
 
     parts: str
-    """What its components are called, in their order; of a symmetric tensor each once."""
+    """Names of its components, in order; of a symmetric tensor each once."""
     of: Callable[[FloatArray, Material | None], FloatArray]
     unit: str = ""
     needs_material: bool = False
 
     def components(self, values: FloatArray) -> dict[str, FloatArray]:
-        """Components (...) of values (..., 2, 2), (..., 2) or (...), by what they are called."""
+        """Components (...) of values (..., 2, 2), (..., 2) or (...), by name."""
         names = self.parts.split() or [""]
         places: dict[str, Any] = {name: (..., *map("xy".index, name)) for name in names}
         return {name: values[place] for name, place in places.items()}
 
 
 def determinant(F: FloatArray) -> FloatArray:
-    """(k,) J [-]; NaN, silently, where F is."""
+    """(k,) J = det F [-]; NaN, without a warning, where F is NaN."""
     return np.asarray(F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0])
 
 
@@ -55,7 +55,7 @@ def stretches(F: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     C = F.swapaxes(-1, -2) @ F
     half, difference = 0.5 * (C[..., 0, 0] + C[..., 1, 1]), 0.5 * (C[..., 0, 0] - C[..., 1, 1])
     larger = np.sqrt(half + np.hypot(difference, C[..., 0, 1]))
-    # Not the root of the difference, which cancels.
+    # Not the root of half - hypot, a difference that cancels.
     smaller = np.abs(determinant(F)) / np.maximum(larger, 1e-12)
     return larger, smaller, 0.5 * np.arctan2(C[..., 0, 1], difference)
 
@@ -77,7 +77,7 @@ def _logarithmic(F: FloatArray) -> FloatArray:
 def _of_material(
     of: Callable[[Material, FloatArray], FloatArray],
 ) -> Callable[[FloatArray, Material | None], FloatArray]:
-    """A field of a material and F, NaN where F isn't a deformation: det F <= 0 or NaN."""
+    """Make a field of a material and F; NaN where F isn't a deformation: det F <= 0 or NaN."""
 
     def found(F: FloatArray, material: Material | None) -> FloatArray:
         assert material is not None
@@ -119,10 +119,10 @@ FIELDS: dict[str, Field] = {
         "", _of_material(lambda law, F: np.asarray(law.energy(JetMatrix(F, 0)).value)), "MPa", True
     ),
 }
-"""By their names: F; J = det F; the angle of R in F = RU, counter-clockwise; the larger and smaller
-principal stretch and the larger one's direction in the reference; E = (F'F - I)/2; Hencky's ln
+"""By name: F; J = det F; the angle of R in F = RU, counter-clockwise; the larger and smaller
+principal stretch and the direction of the larger one in the reference; E = (F'F - I)/2; Hencky's ln
 U, U^2 = F'F; in plane strain the first Piola-Kirchhoff stress P = dW/dF, Cauchy's PF'/J, and the
-energy W of the reference's volume.
+energy W per volume of the reference.
 """
 
 
@@ -158,8 +158,8 @@ def nodal_gradient(mesh: Mesh, nodal: FloatArray) -> FloatArray:
 def interpolation_error(mesh: Mesh, nodal: FloatArray) -> FloatArray:
     """(n, c) estimated error of quadratic elements in nodal fields (n, c), rms around each node.
 
-    The gradients of neighbours differ by that of the error, a wave from node to node, h/2 apart in
-    elements of sides h: its rms is h/(4 pi) times that of its gradient.
+    The gradients of neighbouring elements differ by that of the error, taken for a wave of length
+    h/2, the spacing of nodes in elements of side h: its rms is h/(4 pi) times that of its gradient.
     """
     gradients, areas = element_gradients(mesh, nodal), _slopes(mesh)[1]
     off = gradients - nodal_gradient(mesh, nodal)[mesh.cells]
@@ -184,7 +184,7 @@ def _slopes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
 
 @lru_cache(maxsize=2)
 def _nodal_slopes(mesh: Mesh) -> csr_array:
-    """(2 n, n) that takes nodal values to their slopes along x and y at each node in turn."""
+    """(2 n, n) matrix from nodal values to their slopes, along x and y in turn, at each node."""
     slopes, n = _slopes(mesh)[0], len(mesh.nodes)
     row = (2 * mesh.cells[:, :, None] + np.arange(2)).reshape(*slopes.shape[:2], 1)
     share = 1.0 / np.bincount(mesh.cells.ravel(), minlength=n)[row // 2]
@@ -193,7 +193,7 @@ def _nodal_slopes(mesh: Mesh) -> csr_array:
 
 
 def mean_around(mesh: Mesh, values: FloatArray) -> FloatArray:
-    """(n, ...) means over the elements around each node of values (m, ...) of the elements."""
+    """(n, ...) means of element values (m, ...) over the elements around each node."""
     (m, k), n = mesh.cells.shape, len(mesh.nodes)
     where = mesh.cells.ravel(), np.repeat(np.arange(m), k)
     around = csr_array((np.ones(m * k), where), (n, m))

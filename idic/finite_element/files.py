@@ -1,11 +1,11 @@
-"""Files of a displacement measured at nodes: HDF5 to read back, VTU, CSV, maps of the pixels.
+"""Files of a measured nodal displacement: HDF5 that can be read back, VTU, CSV, pixel maps.
 
 The HDF5 file can be read with h5py alone::
 
     nodes (n, 2)    cells (m, 6)    @element @format @unit @info (JSON: all that is not an array)
     displacement, start, standard_deviation, noise_deviation (n, 2)    each with @unit
     gradient_covariance (n, 4, 4)    roots (n, 2, k) float16, over @largest, of u's covariance
-    fields/NAME (n, ...) float32, with @unit: what follows from them, see ``fields.FIELDS``
+    fields/NAME (n, ...) float32, with @unit: fields derived from these, see ``fields.FIELDS``
 
 Lengths are in mm, or in px where the size of a pixel isn't known; ``Given.unit`` says which.
 """
@@ -39,28 +39,28 @@ _VECTORS = {
     "standard_deviation": ("sd_u", "sd_v"),
     "microfluctuation": ("w_x", "w_y up"),
 }
-"""What components of lengths are called in tables."""
+"""Names in tables of the components of vectors that are lengths."""
 
 
 class Given(NamedTuple):
-    """What else than the measurement is known."""
+    """What is known besides the measurement."""
 
     unit: str = "mm"
-    """Of lengths: "mm" or "px"."""
+    """Unit of lengths: "mm" or "px"."""
     material: Material | None = None
-    """In plane strain, for stresses."""
+    """Material law in plane strain, needed for stresses."""
     correlation: Result | None = None
-    """For w, what its ansatz leaves."""
+    """Correlation with the ansatz that the microfluctuation field w is relative to."""
 
 
 NO_MORE = Given()
-"""Images alone, whose pixels have a size in mm."""
+"""Nothing but images whose pixel size is known in mm."""
 
 
 def write_result(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> None:
     """Write all of a result as HDF5, losslessly and atomically.
 
-    For readers without modeharvest also all fields that follow.
+    All derived fields are written too, for readers without modeharvest.
     """
     with atomic_hdf5(path) as file:
         plain = {name: to_plain(getattr(result, name)) for name in _PLAIN}
@@ -86,7 +86,7 @@ def write_result(path: Path | str, result: NodalResult, given: Given = NO_MORE) 
 
 
 def read_result(path: Path | str, with_roots: bool = False) -> NodalResult:
-    """Read what :func:`write_result` wrote; InputError if the file is missing, cut or foreign."""
+    """Read what :func:`write_result` wrote; InputError for a missing, cut or foreign file."""
     with open_hdf5(path, "a measured displacement (HDF5)", "measure again", FORMAT) as file:
         mesh, info = read_mesh(file), json.loads(file.attrs["info"])
         if not isinstance(info, dict) or info.keys() != set(_PLAIN):
@@ -106,9 +106,9 @@ def read_result(path: Path | str, with_roots: bool = False) -> NodalResult:
 
 
 def field_names(given: Given = NO_MORE) -> list[str]:
-    """Names of all that is written: of lengths, of ``fields.FIELDS``, "sd_..." of its deviations.
+    """Names of all fields written: lengths, ``fields.FIELDS``, and their deviations "sd_...".
 
-    w needs a correlation, stresses a material.
+    w requires a correlation, stresses require a material.
     """
     lengths = [name for name in _VECTORS if given.correlation or name != "microfluctuation"]
     names = [name for name, field in FIELDS.items() if given.material or not field.needs_material]
@@ -118,7 +118,7 @@ def field_names(given: Given = NO_MORE) -> list[str]:
 def field_at(
     result: NodalResult, name: str, where: Where = None, given: Given = NO_MORE
 ) -> FloatArray:
-    """(n, ...), (rows, cols, ...) or (k, ...) one of them at the nodes, at pixels or at points."""
+    """Evaluate one field at nodes (n, ...), at pixels (rows, cols, ...) or at points (k, ...)."""
     if name == "displacement":
         return result.values_at(result.displacement, where)
     if name == "standard_deviation":
@@ -133,7 +133,7 @@ def field_at(
 
 
 def write_vtu(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> None:
-    """Write mesh and fields for ParaView, atomically; these in single precision, not compressed."""
+    """Write mesh and fields for ParaView, atomically; fields in single precision, uncompressed."""
     fields = {
         f"{name}_{given.unit}" if name in _VECTORS else name:
         field_at(result, name, None, given).astype(np.float32) for name in field_names(given)
@@ -143,7 +143,7 @@ def write_vtu(path: Path | str, result: NodalResult, given: Given = NO_MORE) -> 
 
 
 def components(name: str, values: FloatArray, unit: str) -> dict[str, FloatArray]:
-    """The components (...) of a field, by what they are called in tables."""
+    """The components (...) of a field, by their names in tables."""
     if name in _VECTORS:
         labels = [f"{label} [{unit}]" for label in _VECTORS[name]]
         return dict(zip(labels, np.moveaxis(values, -1, 0), strict=True))
@@ -158,7 +158,7 @@ def write_csv(
 ) -> None:
     """Write all fields at points (k, 2) [mm], or at the nodes, as CSV, atomically.
 
-    NaN beside the mesh.
+    Values outside the mesh are NaN.
     """
     x, y = (result.mesh.nodes if points is None else np.asarray(points, dtype=np.float64)).T
     row, col = result.grid.to_px(x, y)
@@ -176,9 +176,9 @@ def write_maps(
     names: Sequence[str] = ("displacement", "standard_deviation", "logarithmic"),
     given: Given = NO_MORE,
 ) -> tuple[Path, ...]:
-    """Write fields at the pixels as float32 TIFF, NaN off the material.
+    """Write fields at the pixels as float32 TIFF, NaN outside the material.
 
-    ``names`` are those of :func:`field_names`. Files are called ``stem`` and what they hold:
+    ``names``: some of :func:`field_names`. A file's name is ``stem`` and the field in it:
     "stem_u_mm.tif", "stem_logarithmic_xy.tif", "stem_cauchy_xx_MPa.tif".
     """
     paths = []

@@ -1,7 +1,7 @@
-"""A T6 mesh of the material: from a mask alone, or from a mesh that is given.
+"""A T6 mesh of the material, made from a mask or from a mesh that is given.
 
-The boundary of a mask is the contour at one half of the mask blurred by 1.5 px, smoothed along
-itself, with its corners put back: within some 0.2 px of a smooth edge, holes included.
+The boundary of a mask is the contour at one half of the mask blurred by 1.5 px, smoothed along its
+length, with its corners restored. It lies within some 0.2 px of a smooth edge, also at holes.
 """
 
 from __future__ import annotations
@@ -29,51 +29,51 @@ find_contours: Any = measure.find_contours
 
 _BLUR_PX = 1.5
 _WINDOW_PX = 41
-"""Cubics are fitted to that much of a contour: a pixel's edge is smoothed away, no curvature."""
+"""Longest window of the cubic fits to a contour: it removes the steps of pixels, no curvature."""
 _ROUNDED_PX = 4
-"""Of a contour, rounded off at corners by the blur."""
+"""Length of a contour, on each side of a corner, that the blur rounds off."""
 _CORNER = np.deg2rad(40.0)
 _ARM_PX = 12
-"""How far from a corner its two sides are looked at; the nearest third of that is rounded off."""
+"""Length of the sides by which a corner is found; their nearest third is rounded off."""
 _LEAST_SINE = 0.2
-"""Of the angle between the two sides of a corner."""
+"""Least sine of the angle between a corner's two sides for which their intersection is used."""
 _NARROWEST_PX = 3.0
-"""Material between two holes that can still be meshed."""
+"""Least width of material between two holes that can be meshed."""
 
 _PIPE, _MESHER = subprocess.PIPE, (sys.executable, "-P", "-m", "modeharvest.fem.meshing")
 _SECONDS, _SECONDS_PER_ELEMENT = 60.0, 2e-3
-"""That gmsh may take: many times what it takes where no boundaries cross."""
+"""Time that gmsh may take [s]: many times what it takes where no boundaries cross."""
 _LEAST_ISLAND, _LEAST_HOLE = 4.0, 0.25
-"""Areas of what is meshed, over the square of an element's edge [-]."""
+"""Least areas of what is meshed, over the square of an element's edge [-]."""
 _MARGIN = 1.1
-"""That a mask's pixels have over the smoothed boundary around them, at most."""
+"""Area of a mask's pixels over that inside the smoothed boundary around them, at most [-]."""
 _OPENINGS_PX = (2.0, 3.0, 4.0)
-"""Radii of disks that fit on what is left, tried in turn where material is too narrow."""
+"""Radii of the disks of a morphological opening, tried in turn where material is too narrow."""
 _ISLANDS_NAMED = 3
 
 Loops = tuple[tuple[FloatArray, ...], ...]
-"""Of an island, the outer one first: curves (k, 2) of (column, -row) [px], whose corners are where
-one curve ends."""
+"""Boundary loops of an island, the outer one first. Each consists of curves (k, 2) of (column,
+-row) [px] that end at the loop's corners."""
 _REVERSED = {"T3": [0, 2, 1], "T6": [0, 2, 1, 5, 4, 3]}
-"""Node numbers the other way round."""
+"""Order of an element's nodes that reverses its orientation."""
 
 
 class MeshedMaterial(NamedTuple):
-    """What of a mask is measured."""
+    """The part of a mask that is measured, and its mesh."""
 
     mesh: Mesh
-    """T6 [mm, or px where the size of a pixel isn't known]."""
+    """T6 mesh [mm, or px where the size of a pixel isn't known]."""
     mask: BoolArray
     """(rows, cols) True on material that the mesh covers."""
     changes: tuple[str, ...]
-    """What of the mask was left out or filled, in sentences."""
+    """What was left out of the mask, or filled, in sentences."""
 
 
 def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, float, tuple[str, ...]]:
-    """Fill the holes, and leave out islands and ligaments, that elements of so many px don't fit.
+    """Fill holes, and remove islands and ligaments, that are too small for elements of this size.
 
-    Returns the mask of what is left, its least width [px], and what was changed, in sentences;
-    ``element_px``: edge length along edges [px].
+    Returns the remaining mask, its least width [px], and what was changed, in sentences.
+    ``element_px``: length of the elements' sides along edges [px].
     """
     changes = []
     kept = mask | ~large_parts(~mask, _LEAST_HOLE * element_px**2)
@@ -112,9 +112,9 @@ def meshable(mask: BoolArray, element_px: float) -> tuple[BoolArray, float, tupl
 def mesh_of_mask(
     mask: BoolArray, grid: PixelGrid, element_px: float, edge_element_px: float
 ) -> MeshedMaterial:
-    """Mesh what can be meshed of a mask (rows, cols), elements of so many px inside and at edges.
+    """Mesh a mask (rows, cols) as far as possible; element sizes [px] in the interior, at edges.
 
-    InputError if there is no island of at least four elements, or gmsh isn't there.
+    InputError if there is no island of at least four elements, or gmsh isn't installed.
     """
     if find_spec("gmsh") is None:
         raise InputError(
@@ -145,7 +145,7 @@ def mesh_of_mask(
 
 
 def _unfolded(nodes: FloatArray, cells: IntArray) -> FloatArray:
-    """Nodes (n, 2), the sides straight of T6 elements that curved ones fold, as in a notch."""
+    """Nodes (n, 2); T6 elements that curved sides fold, as in a notch, get straight sides."""
     folded, straight = cells[non_positive_jacobians(nodes, cells, "T6")], nodes.copy()
     corners = nodes[folded[:, :3]]
     straight[folded[:, 3:]] = 0.5 * (corners + np.roll(corners, -1, axis=1))
@@ -156,7 +156,7 @@ def _meshed(
     child: subprocess.Popen[bytes], parts: tuple[Loops, ...], element_px: float, edge_px: float,
     area_px: int,
 ) -> tuple[FloatArray, IntArray]:  # fmt: skip
-    """Nodes (n, 2) [px] and T6 elements by gmsh in a process apart, which may crash or not end."""
+    """Nodes (n, 2) [px] and T6 elements by gmsh, in a separate process that may crash or hang."""
     seconds = _SECONDS + _SECONDS_PER_ELEMENT * area_px / min(element_px, edge_px) ** 2
     try:
         found, errors = child.communicate(pickle.dumps((parts, element_px, edge_px)), seconds)
@@ -166,7 +166,7 @@ def _meshed(
         child.kill()
         failed, got = True, f"none in {seconds:.0f} s"
     if failed:
-        lacks = got.startswith(("OSError: ", "ImportError: "))  # it loads graphics, used or not
+        lacks = got.startswith(("OSError: ", "ImportError: "))  # gmsh always loads graphics
         advice = "install that library" if lacks else "smooth the mask, fill its narrow holes"
         raise InputError(f"expected gmsh to mesh the mask, got {got}; {advice}, or give a mesh")
     nodes, cells = pickle.loads(found)
@@ -174,7 +174,7 @@ def _meshed(
 
 
 def _narrowest(mask: BoolArray) -> float:
-    """Width of the material where it is narrowest between two holes, or a hole and outside [px]."""
+    """Least width of the material between two holes, or between a hole and the outside [px]."""
     outside = np.pad(~mask, 1, constant_values=True)
     hole, count = ndimage.label(outside)
     edge = np.nonzero(outside & ndimage.binary_dilation(~outside))
@@ -187,10 +187,10 @@ def _narrowest(mask: BoolArray) -> float:
 
 
 def quadratic(mesh: Mesh) -> Mesh:
-    """The mesh itself if it is of T6 elements; T3 elements get mid-side nodes.
+    """Convert a mesh of T3 elements to T6 by adding mid-side nodes; a T6 mesh is kept.
 
-    Nodes of no element are left out; elements that all go clockwise are turned over. InputError if
-    the elements are of another type, or folded.
+    Unused nodes are removed; if all elements are numbered clockwise, they are reversed. InputError
+    if the elements are of another type, or folded.
     """
     used = np.unique(mesh.cells)
     if len(used) < len(mesh.nodes):
@@ -209,14 +209,14 @@ def quadratic(mesh: Mesh) -> Mesh:
 
 
 def _twice_area(nodes: FloatArray, cells: IntArray) -> FloatArray:
-    """(m,) of the triangles of elements' corners, positive if counter-clockwise."""
+    """(m,) twice the areas of the elements' corner triangles, positive if counter-clockwise."""
     return np.asarray(np.linalg.det(nodes[cells[:, 1:3]] - nodes[cells[:, :1]]))
 
 
 def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
-    """Find the boundaries of a mask, of each island, for elements of so many px.
+    """Find the boundary loops of each island of a mask, for elements of this size [px].
 
-    Islands and holes too small for such elements are left out; :func:`meshable` says which.
+    Islands and holes too small for such elements are left out; :func:`meshable` reports them.
     """
     inside = np.pad(mask, 8)
     islands, count = ndimage.label(inside)
@@ -230,7 +230,7 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
         area = signed_area(points)
         row, col = np.rint(contour[0]).astype(int)
         island = 1 if count == 1 else int(islands[tuple(nearest[:, row, col])])
-        # Of material inside a contour the signed area is positive, x right and y up.
+        # The signed area is positive for material inside a contour, x right and y up.
         if abs(area) < (_LEAST_ISLAND if area > 0.0 else _LEAST_HOLE) * element_px**2:
             continue
         loops.setdefault(island, []).append((area, points + np.array([-8.0, 8.0])))
@@ -245,12 +245,12 @@ def boundaries(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
 
 
 def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
-    """Smooth a closed contour between its corners, and sample it twice an element."""
+    """Smooth a closed contour between its corners, and sample it at two points per element."""
     from scipy.signal import savgol_filter  # 0.2 s to load, which few commands need
 
     length = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     total, count = float(length.sum()), max(16, int(length.sum()))
-    at = np.arange(count) * total / count  # one point a pixel
+    at = np.arange(count) * total / count  # one point per pixel
     s, closed = np.concatenate([[0.0], np.cumsum(length)]), np.vstack([points, points[:1]])
     raw = np.stack([np.interp(at, s, closed[:, k]) for k in (0, 1)], axis=1)
     corners = _corners(raw)
@@ -272,12 +272,12 @@ def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
 
 
 def _window(count: int) -> int:
-    """Pixels that a contour of so many is smoothed over: odd, an eighth of it, at most 41."""
+    """Smoothing window [px] of a contour of ``count`` px: odd, an eighth of it, at most 41."""
     return int(np.clip(count // 8, 5, _WINDOW_PX)) | 1
 
 
 def _corners(points: FloatArray) -> IntArray:
-    """Numbers of the points (one a pixel) where a contour turns sharply, ascending."""
+    """Indices of the points (one per pixel) where a contour turns sharply, ascending."""
     if len(points) < 4 * _ARM_PX:
         return np.empty(0, dtype=np.int64)
     near = _ARM_PX // 3
@@ -299,7 +299,7 @@ def _corners(points: FloatArray) -> IntArray:
 
 
 def _intersection(points: FloatArray, corner: int) -> FloatArray:
-    """Where the lines through the two sides of a corner meet; the corner if that is elsewhere."""
+    """Intersection of lines through a corner's two sides; the corner itself if that is far off."""
     lines = []
     for sign in (1, -1):
         side = points[(corner + sign * np.arange(_ARM_PX // 3, _ARM_PX + 1)) % len(points)]

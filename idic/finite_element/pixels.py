@@ -1,14 +1,14 @@
-"""Images and pixels of a mesh: continued beyond edges, sorted by element, normal equations.
+"""Images and pixels on a mesh: continued beyond edges, sorted by element, normal equations.
 
-Near an edge the spline through the deformed image reads pixels beyond it. What continues the
-material there is what errors at edges are made of: local quadratic polynomials. Of fine speckle
-they know little; so a residual weighs by the inverse of its variance, that of continued pixels
-included, which is the one that the outermost pixels of the material have when they are continued
-from the others.
+Near an edge the spline through the deformed image reads pixels beyond it. There the material is
+continued by local quadratic polynomials, which cause the errors at edges: they predict little of
+fine speckle. Therefore a residual is weighted by the inverse of its variance, including that of
+continued pixels. The latter is the variance that the outermost pixels of the material have when
+they are continued from the others.
 
 For every pixel x of the reference that counts, with r = f(x) - g(x + u) and the gradient h that
-weighs it, an element sums N_a N_b h_i h_j and N_a h_i r over its pixels. The elements are dealt to
-the threads and summed in order, so that the result does not depend on how many there are.
+weighs it, an element sums N_a N_b h_i h_j and N_a h_i r over its pixels. The elements are divided
+among the threads and summed in order, so that the result doesn't depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.masks import grown
 
 _BLOCK = 64
-"""Pixels of an element that are worked on together."""
+"""Pixels of an element that are processed together."""
 _REACH_PX = 4
-"""How far beyond the material pixels are continued by polynomials."""
+"""Distance beyond the material up to which pixels are continued by polynomials [px]."""
 _SIGMA_PX = 1.5
-"""Of the Gaussian that weighs the material's pixels for that."""
+"""Standard deviation of the Gaussian weights of the material's pixels for that."""
 _WINDOW_PX = 6
 _RIDGE = 1e-3
-"""Against polynomials that too few pixels determine, of the sum of weights."""
+"""Regularisation of polynomials that too few pixels determine, over the sum of weights."""
 _LEAST_SIGNAL = 0.5
-"""Of signal in the slopes of an element; with less than that they may be nothing but noise."""
+"""Least share of signal in an element's slopes; with less they may be nothing but noise."""
 _TINY = float(np.finfo(np.float64).tiny)
 _BEYOND_PX = 2
-"""How far from the mesh the edge of a mask may be, along rows and columns."""
+"""Largest distance of a mask's edge from the mesh, along rows and columns."""
 
 
 def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelPair:
-    """Make one level of a pair of images; on the finest, g continued by quadratic polynomials.
+    """Make one level of an image pair; on the finest, g is continued by quadratic polynomials.
 
     pair, level : as for :func:`modeharvest.idic.solver.pyramid.level_pair`.
     edge_px : pixels closer than this to the mask's edge are left out on the finest level [px].
-    order : of the spline.
+    order : of the spline that samples g.
     """
     if level != FULL:
         return level_pair(pair, level, edge_px, order)
@@ -75,16 +75,16 @@ class ContinuedPixels(NamedTuple):
     """Which pixels of the deformed image are continued, and their error's variance."""
 
     outside: NDArray[Any]
-    """(rows, cols) float32, 1 where a pixel is continued and 0 on material; (0, 0) for nowhere."""
+    """(rows, cols) float32, 1 where a pixel is continued and 0 on material; (0, 0) if none is."""
     variance: float
-    """Of a continued pixel's error, over that of the residual's noise [-]."""
+    """Variance of a continued pixel's error, over that of the residual's noise [-]."""
     summed: NDArray[Any]
-    """(rows + 1, cols + 1) int32 summed-area table of them and of what isn't valid."""
+    """(rows + 1, cols + 1) int32 summed-area table of continued and of invalid pixels."""
 
 
 NONE_CONTINUED = ContinuedPixels(np.zeros((0, 0), np.float32), 0.0, np.zeros((0, 0), np.int32))
 _LARGEST_VARIANCE = 1e6
-"""Of continued pixels where there is no noise [-]."""
+"""Largest variance of continued pixels, which they have where there is no noise [-]."""
 
 
 def continued_pixels(
@@ -92,8 +92,8 @@ def continued_pixels(
 ) -> ContinuedPixels:
     """Estimate the continued pixels' variance from the outermost pixels of the material.
 
-    ``noise_f``, ``noise_g``: variances of the images' noise [grey levels^2]; ``valid``: where the
-    deformed image's are (rows, cols), None for everywhere.
+    ``noise_f``, ``noise_g``: variances of the images' noise [grey levels^2]; ``valid``: valid
+    pixels of the deformed image (rows, cols), None for all.
     """
     g, mask = pair.deformed, pair.deformed_mask
     if mask is None or mask.all():
@@ -105,7 +105,7 @@ def continued_pixels(
         found, (rows, cols) = np.empty(g.shape, np.float32), np.nonzero(outermost)
         in_parallel(_continue, *map(readable, (g, inside, rows, cols)), found)
         error = float(np.mean((found[outermost] - g[outermost]) ** 2))
-        # The tried pixel has noise itself, and so would have the one that is missing.
+        # The pixel tried has noise itself, and so would the missing pixel that it stands for.
         excess, noise = max(0.0, error - 2.0 * noise_g), noise_f + noise_g
         ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
     lost = ~mask if valid is None else ~(mask & valid)
@@ -131,7 +131,7 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
 def _continue(
     image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any], thread: int, threads: int
 ) -> None:
-    A, b, phi = np.empty((6, 6)), np.empty(6), np.ones(6)  # of A the upper triangle
+    A, b, phi = np.empty((6, 6)), np.empty(6), np.ones(6)  # of A only the upper triangle
     decay = np.exp(-0.5 * (np.arange(_WINDOW_PX + 1) / _SIGMA_PX) ** 2)
     for p in range(thread, rows.size, threads):
         i, j = rows[p], cols[p]
@@ -171,25 +171,25 @@ class ElementPixels(NamedTuple):
     xi: NDArray[Any]
     """(2, p) float32 local coordinates [-]."""
     grey: NDArray[Any]
-    """(p,) float32 f there."""
+    """(p,) float32 grey level of f there."""
     slope: NDArray[Any]
     """(2, p) float32 gradient of f there, along x and y [grey levels/mm]; or (2, 0)."""
 
     def only(self, keep: BoolArray) -> ElementPixels:
-        """Some of them: (p,) True where they count."""
+        """Select pixels: (p,) True for those that count."""
         start = np.concatenate([[0], np.cumsum(keep)])[self.start]
         return ElementPixels(start, *(p[..., keep] if p.shape[-1] else p for p in self[1:]))
 
 
 class MeshPixels:
-    """Pixels of masks sorted by the elements of a T6 mesh, those of each mask once."""
+    """Pixels of masks sorted by the elements of a T6 mesh; the sorting of a mask is kept."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self._kept: dict[tuple[PixelGrid, int], tuple[BoolArray, ElementPixels]] = {}
 
     def on(self, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]) -> ElementPixels:
-        """Those of a mask (rows, cols) that are in the mesh, with f (rows, cols) there.
+        """Pixels of a mask (rows, cols) that are in the mesh, with f (rows, cols) there.
 
         InputError if pixels of the mask lie farther than 2 px from those in elements.
         """
@@ -237,32 +237,32 @@ class NodalEquations:
     """(m,) sums of r^2 [grey levels^2]."""
     counts: FloatArray
     weights: FloatArray
-    """(m,) of how many pixels, and the sums of their weights."""
+    """(m,) number of pixels, and sum of their weights."""
     slopes: FloatArray
-    """(m, 2) sums of |h|^2 and of h grad g at x + u [grey levels^2/mm^2]; 0 if these are one."""
+    """(m, 2) sums of |h|^2 and of h grad g at x + u [grey levels^2/mm^2]; 0 if h is grad g."""
     outside: int
     """Pixels mapped to where g isn't valid."""
 
     @property
     def square_sum(self) -> float:
-        """Of r^2 over all elements [grey levels^2]."""
+        """Sum of r^2 over all elements [grey levels^2]."""
         return float(self.squares.sum())
 
     @property
     def pixels(self) -> int:
-        """How many that is over."""
+        """Number of pixels in that sum."""
         return int(self.counts.sum())
 
     @property
     def rms(self) -> float:
-        """Of r [grey levels]."""
+        """Root mean square of r [grey levels]."""
         return float(np.sqrt(self.square_sum / self.pixels))
 
     def signal(self, noise: FloatArray) -> tuple[FloatArray, float]:
-        """(m,) share of each element's slopes that is signal, 0 to 1; grad g over h, at least 1.
+        """(m,) share of signal in each element's slopes, 0 to 1; grad g over h, at least 1.
 
-        ``noise`` (m,): mean of |h|^2 by noise [grey levels^2/mm^2]. Such slopes show nothing: of a
-        sum of h h' that share is what a residual changes by, or more if a blur has flattened h.
+        ``noise`` (m,): mean of |h|^2 by noise [grey levels^2/mm^2], which shows nothing: a residual
+        changes by the share of signal in a sum of h h', or by more if a blur has flattened h.
         """
         slopes = self.blocks[:, [0, 2]].sum(axis=(1, 2, 3))  # shape functions sum to 1
         signal = 1.0 - noise * self.weights / np.maximum(slopes, _TINY)
@@ -280,15 +280,15 @@ def normal_equations(
     continued_in_g: ContinuedPixels = NONE_CONTINUED,
     with_blocks: bool = True,
 ) -> NodalEquations:
-    """Pass over all pixels.
+    """Sum the normal equations over all pixels.
 
-    pixels : of the level's reference, whose gradient there, pushed forward, weighs the residual;
-        if they have none, that of the deformed image at x + u.
-    mesh : T6.
-    level : whose deformed image is sampled.
+    pixels : pixels of the level's reference. The gradient of f there, pushed forward, weighs the
+        residual; if they have none, that of the deformed image at x + u does.
+    mesh : T6 mesh.
+    level : images of which the deformed one is sampled.
     u : (n, 2) displacement of the nodes [mm].
-    continued_in_g : pixels of the deformed image that are continued, by which residuals weigh.
-    with_blocks : whether the blocks are needed, which take most of the time.
+    continued_in_g : continued pixels of the deformed image, which lower the residuals' weights.
+    with_blocks : whether the blocks are needed, which take most of the computing time.
     """
     m, g = len(mesh.cells), level.deformed
     blocks = np.zeros((m if with_blocks else 0, 3, 6, 6))
@@ -345,7 +345,7 @@ def _shapes(xi: Any, begin: int, n: int, N: Any) -> None:
 
 @compiled(inner=True, relaxed=True)
 def _map(pixels: Any, begin: int, n: int, N: Any, u: Any, pixel_size: float, own: Any) -> None:
-    """Fill where a block's pixels are in the deformed image, row and column."""
+    """Fill the positions of a block's pixels in the deformed image, row and column."""
     at_row, at_col, per_px = own[4], own[5], 1.0 / pixel_size
     for m in range(n):
         right = up = 0.0
@@ -358,7 +358,7 @@ def _map(pixels: Any, begin: int, n: int, N: Any, u: Any, pixel_size: float, own
 
 @compiled(inner=True, relaxed=True)
 def _is_interior(n: int, summed: Any, own: Any) -> bool:
-    """Whether all pixels around a block's are those of the deformed image's material."""
+    """Whether all pixels around those of a block show material in the deformed image."""
     top, left = own[4, :n].min(), own[5, :n].min()
     bottom, right = own[4, :n].max() + 2.0, own[5, :n].max() + 2.0
     if top < 0.0 or left < 0.0 or bottom >= summed.shape[0] or right >= summed.shape[1]:
@@ -390,7 +390,7 @@ def _sample(
 
 @compiled(inner=True, relaxed=True)
 def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, own: Any, sums: Any) -> None:
-    """Put F^-T grad f in the place of grad g in a block; sum its square and both' product."""
+    """Replace grad g by F^-T grad f in a block; sum its square and the product of both."""
     for m in range(n):
         s, t = float(pixels.xi[0, begin + m]), float(pixels.xi[1, begin + m])
         r = 1.0 - s - t
@@ -418,7 +418,7 @@ def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, own: Any, sum
 
 @compiled(inner=True, relaxed=True)
 def _weigh(n: int, outside: Any, variance: float, own: Any) -> None:
-    """Weigh what continued pixels make of a block by the inverse of its variance."""
+    """Weigh the pixels of a block that continued pixels affect by the inverse of their variance."""
     rows, cols = outside.shape
     for m in range(n):
         if own[3, m] > 0.0:

@@ -1,4 +1,4 @@
-"""The displacement that finite-element DIC measured: on the mesh, at pixels, at any point."""
+"""The displacement measured by finite-element DIC: on the mesh, at pixels, at any point."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from modeharvest.util.masks import grown
 from modeharvest.util.progress import Progress, silent
 
 _BEYOND_PX = 2.0
-"""How far beyond the mesh's edge its fields are continued: the edge is known to half a pixel."""
+"""Extrapolation of fields beyond the mesh's edge: the edge is known to half a pixel."""
 _STEP = 1e-5
-"""Of a mode's parameters, for derivatives: these are of waves a few dozen radians long."""
+"""Step of a mode's parameters for derivatives; the mode's waves are a few dozen radians long."""
 WHOLE = "the whole displacement"
 Where = PixelGrid | FloatArray | None
-"""Pixels, points (k, 2) [mm], or the nodes."""
+"""Where to evaluate a field: pixels, points (k, 2) [mm], or None for the nodes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +45,15 @@ class NodalResult:
     mesh: Mesh
     displacement: FloatArray
     start: FloatArray
-    """Nodes and u there (n, 2) [mm], and where the measurement began."""
+    """Mesh, displacement u (n, 2) of its nodes [mm], and initial guess of u (n, 2) [mm]."""
     standard_deviation: FloatArray
-    """(n, 2) of u by noise and smoothing [mm]."""
+    """(n, 2) standard deviation of u due to noise and smoothing [mm]."""
     noise_deviation: FloatArray
-    """(n, 2) of u by noise alone [mm]."""
+    """(n, 2) standard deviation of u due to noise alone [mm]."""
     gradient_covariance: FloatArray
-    """(n, 4, 4) of the components xx, xy, yx, yy of F by noise and smoothing [-]."""
+    """(n, 4, 4) covariance of xx, xy, yx, yy of F due to noise and smoothing [-]."""
     grid: PixelGrid
-    """The pixels of the images."""
+    """Pixel grid of the images."""
     cutoff_px: float | None
     tried: tuple[Risk, ...]
     """Cut-off wavelength of the regularisation [px], if any, and those that were tried for it."""
@@ -61,28 +61,28 @@ class NodalResult:
     residual_noise: float
     pixels: int
     outside: int
-    """Root mean square of the residual and what of it is noise [grey levels]; pixels compared, and
-    pixels mapped to where the deformed image isn't valid."""
+    """Root mean square of the residual, and of the noise in it [grey levels]; number of pixels
+    compared, and of pixels mapped to where the deformed image isn't valid."""
     effective_unknowns: float
-    """What the images determine of them [-]."""
+    """Effective number of unknowns that the images determine [-]."""
     library: str
-    """That factorised the matrices."""
+    """Name of the library that factorised the matrices."""
     warnings: tuple[str, ...] = ()
-    """Sentences."""
+    """Warnings, one sentence each."""
     contradicted: float | None = None
-    """Share of free edges' nodes where a law changes u significantly; None without one [-]."""
-    shown: str = "speckle"  # or "contours", of which residuals are distances [px]
+    """Share of nodes on free edges where a law changes u significantly [-]; None without a law."""
+    shown: str = "speckle"  # or "contours", for which residuals are distances [px]
     roots: FloatArray | None = None
-    """(n, 2, k) whose outer products sum up to the covariance of all nodes [mm]; of a result that
-    was read, if they were wanted."""
+    """(n, 2, k) vectors whose outer products sum up to the covariance of all nodal displacements
+    [mm]; for a result that was read, only if requested."""
 
     @property
     def unknowns(self) -> int:
-        """How many displacements are sought."""
+        """Number of unknown displacement components."""
         return self.displacement.size
 
     def on_pixels(self, nodal: FloatArray, grid: PixelGrid | None = None) -> FloatArray:
-        """(rows, cols, ...) fields (n, ...) at pixels; NaN farther than 2 px from the mesh."""
+        """Nodal fields (n, ...) at pixels (rows, cols, ...); NaN over 2 px away from the mesh."""
         mesh, grid = self.mesh, grid or self.grid
         located = locate(mesh.nodes, mesh.cells, mesh.element, grid)
         flat = np.ascontiguousarray(nodal.reshape(len(nodal), -1))
@@ -94,11 +94,11 @@ class NodalResult:
 
     @cached_property
     def _beside(self) -> dict[PixelGrid, tuple[NDArray[Any], ...]]:
-        """The pixels beside the mesh, of grids that were asked for."""
+        """Cache of the pixels beside the mesh, by grid."""
         return {}
 
     def at(self, points: FloatArray, nodal: FloatArray | None = None) -> FloatArray:
-        """(k, ...) nodal fields (n, ...), by default u [mm], at points (k, 2) [mm]; or NaN."""
+        """Nodal fields (n, ...), by default u [mm], at points (k, 2) [mm]; NaN outside the mesh."""
         return nodal_values(self.mesh, self.displacement if nodal is None else nodal, points)
 
     def displacement_on(self, grid: PixelGrid | None = None) -> FloatArray:
@@ -110,7 +110,7 @@ class NodalResult:
         return self.deviation_at(self.standard_deviation, grid or self.grid)
 
     def at_points(self, spacing: float) -> LocalField:
-        """u and its standard deviation as a local DIC would give them, about so far apart [mm]."""
+        """u and its standard deviation as local DIC data, at points about this far apart [mm]."""
         every = max(1, int(spacing / self.grid.pixel_size))
         x, y = np.meshgrid(self.grid.x[every // 2 :: every], self.grid.y[every // 2 :: every])
         points = np.column_stack([x.ravel(), y.ravel()])
@@ -123,7 +123,7 @@ class NodalResult:
         """One of ``fields.FIELDS``: strains, and with a material stresses.
 
         Returns (n, ...) at the nodes, (rows, cols, ...) at the pixels of a grid, (k, ...) at points
-        (k, 2) [mm]; NaN beside the mesh.
+        (k, 2) [mm]; NaN outside the mesh.
         """
         F = self.values_at(self.deformation_gradient, where)
         found = field_of(name, F.reshape(-1, 2, 2), material)
@@ -132,7 +132,7 @@ class NodalResult:
     def field_deviation(
         self, name: str, where: Where = None, material: Material | None = None
     ) -> FloatArray:
-        """Standard deviation of :meth:`field` by noise and smoothing of u; the same shapes."""
+        """Standard deviation of :meth:`field` due to noise and smoothing of u; the same shapes."""
         key, known = (name, material), self._deviations
         if key not in known:
             F, covariance = self.deformation_gradient, self.gradient_covariance
@@ -141,11 +141,11 @@ class NodalResult:
 
     @cached_property
     def _deviations(self) -> dict[tuple[str, Material | None], FloatArray]:
-        """Those at the nodes that were asked for."""
+        """Cache of deviations at the nodes."""
         return {}
 
     def microfluctuation(self, result: Result, where: Where = None) -> FloatArray:
-        """(n, 2), (rows, cols, 2) or (k, 2) w = u - v0 - sum v_i phi_i [mm], of a correlation's."""
+        """w = u - v0 - sum v_i phi_i [mm] of a correlation's ansatz; shapes as in :meth:`field`."""
         w = self.displacement - result.ansatz.displacement_at(result.unknowns, self.mesh.nodes)
         return self.values_at(w, where)
 
@@ -156,7 +156,7 @@ class NodalResult:
         return nodal if where is None else self.at(where, nodal)
 
     def deviation_at(self, nodal: FloatArray, where: Where) -> FloatArray:
-        """The same of standard deviations, which stay positive."""
+        """The same for standard deviations, interpolated such that they stay positive."""
         smallest = 1e-12 * max(self.grid.pixel_size, 1e-3)
         return np.exp(self.values_at(np.log(np.maximum(nodal, smallest)), where))
 
@@ -173,14 +173,14 @@ class WholeField:
     measured: NodalResult
     refit: Result
     start: str = ""
-    """Where the measurement began, in words."""
+    """What the measurement started from, in words."""
 
 
 def refitted(measured: NodalResult, ansatz: Ansatz, guess: FloatArray, mask: BoolArray) -> Result:
-    """An ansatz, fitted to what was measured on the pixels of a mask; ``guess``: (n,) unknowns.
+    """Fit an ansatz to the measured displacement on a mask's pixels; ``guess``: (n,) unknowns.
 
-    Its covariance is that of what was measured, by noise, smoothing and edges, unless that is from
-    a file.
+    Its covariance is propagated from that of the measured displacement by noise, smoothing and
+    edges, unless the latter was read from a file.
     """
     u, roots, mesh = measured.displacement_on(), measured.roots, measured.mesh
     inside = mask & np.isfinite(u[..., 0])
@@ -197,12 +197,12 @@ def refitted(measured: NodalResult, ansatz: Ansatz, guess: FloatArray, mask: Boo
     known = np.flatnonzero(np.isfinite(np.diag(inverse)))
     own = np.ix_(known, known)
     moved = np.linalg.solve(_hessian(fit, u, inside)[own], slopes[known])
-    inverse[own] = moved @ moved.T / max(2.0 * fit.noise_sd**2, 1e-300)  # of which it is a factor
+    inverse[own] = moved @ moved.T / max(2.0 * fit.noise_sd**2, 1e-300)  # Result multiplies by it
     return replace(fit, inverse=inverse)
 
 
 def _hessian(fit: Result, u: FloatArray, inside: BoolArray) -> FloatArray:
-    """(n, n) of a fit's cost: beside w, which is left of u, not Gauss and Newton's matrix."""
+    """(n, n) Hessian of a fit's cost: with a residual w it isn't the Gauss-Newton matrix."""
     fits, a = Assembly(fit.ansatz, fit.grid, inside), fit.unknowns
     here = fits.displacement(a, u)
     H = here.matrix
@@ -216,9 +216,9 @@ def refitted_correlation(
     measured: NodalResult, pair: ImagePair, ansatz: Ansatz, guess: FloatArray, mask: BoolArray,
     options: CorrelationOptions, progress: Progress = silent,
 ) -> tuple[Result, Result]:  # fmt: skip
-    """Correlate from an ansatz :func:`refitted` to what was measured; the result, and the refit.
+    """Correlate from a fit of the ansatz to what was measured (:func:`refitted`); result and fit.
 
-    Where the correlation ends astray the refit is the result, with the outcome REFITTED.
+    If the correlation fails (``correlate.ASTRAY``), the result is the fit, outcome REFITTED.
     """
     refit = refitted(measured, ansatz, guess, mask)
     a = np.append(refit.unknowns, guess[refit.unknowns.size :])
@@ -229,7 +229,7 @@ def refitted_correlation(
 
 
 def _beside(mesh: Mesh, grid: PixelGrid, located: Located) -> tuple[NDArray[Any], ...]:
-    """Rows, columns (k,), of pixels up to 2 px beside the mesh; nearest elements' nodes and N."""
+    """Rows, columns (k,) of pixels up to 2 px outside the mesh; nodes and N of nearest elements."""
     rows, cols = np.nonzero(grown(mask := located.mask, _BEYOND_PX) & ~mask)
     edge = np.argwhere(mask & grown(~mask, 1.0))
     element = located.element[*edge[KDTree(edge).query(np.column_stack([rows, cols]))[1]].T]
@@ -238,16 +238,16 @@ def _beside(mesh: Mesh, grid: PixelGrid, located: Located) -> tuple[NDArray[Any]
 
 
 def _continue(beside: tuple[NDArray[Any], ...], nodal: FloatArray, values: FloatArray) -> None:
-    """Fill pixels beside the mesh, by the polynomials of the nearest element."""
+    """Fill pixels outside the mesh by the polynomials of the nearest element."""
     rows, cols, nodes, N = beside
     own = nodal[nodes]
-    # A polynomial through values that change much within an element runs away from them.
+    # Limited, because a polynomial through values that vary strongly in an element runs away.
     found, reach = np.einsum("ka,kac->kc", N, own), 0.5 * np.ptp(own, axis=1)
     values[:, rows, cols] = np.clip(found, own.min(axis=1) - reach, own.max(axis=1) + reach).T
 
 
 def located(mesh: Mesh, points: FloatArray, beside: bool = False) -> tuple[IntArray, FloatArray]:
-    """(k,) elements, -1 or the nearest one beside the mesh, and (k, 2) local coordinates there."""
+    """(k,) elements, -1 or with ``beside`` the nearest off the mesh; (k, 2) local coordinates."""
     if points.ndim != 2 or points.shape[1] != 2:
         raise InputError(f"expected points of shape (k, 2), got {points.shape}")
     x = mesh.nodes[mesh.cells]
@@ -262,21 +262,21 @@ def located(mesh: Mesh, points: FloatArray, beside: bool = False) -> tuple[IntAr
 
 
 def nodal_values(mesh: Mesh, nodal: FloatArray, at: FloatArray, beside: bool = False) -> FloatArray:
-    """(k, ...) nodal fields (n, ...) at points (k, 2) [mm]; NaN beside the mesh, or continued."""
+    """Nodal fields (n, ...) at points (k, 2) [mm]; off the mesh NaN, or if ``beside`` continued."""
     element, xi = located(mesh, at, beside)
     N = shape_functions(mesh.element, xi)
     return np.asarray(np.einsum("ka,ka...->k...", N, nodal[mesh.cells[element]]))
 
 
 def _local_coordinates(mesh: Mesh, element: NDArray[Any], points: FloatArray) -> FloatArray:
-    """(k, 2) of points (k, 2) [mm] in elements (k,) that they are beside."""
+    """(k, 2) local coordinates of points (k, 2) [mm] in elements (k,) that they are outside of."""
     xi: FloatArray = np.full((element.size, 2), 1.0 / 3.0)
-    left = np.arange(element.size)  # most are there after two steps, few at curved sides are not
+    left = np.arange(element.size)  # most converge in two steps, a few at curved sides don't
     for _ in range(8):
         x, at = mesh.nodes[mesh.cells[element[left]]], xi[left]
         off = np.einsum("ka,kai->ki", shape_functions(mesh.element, at), x) - points[left]
         F = np.einsum("kai,kaj->kij", x, shape_gradients(mesh.element, at))
         step = np.linalg.solve(F, off[..., None])[..., 0]
         xi[left] = np.clip(at - step, -1.0, 2.0)
-        left = left[np.abs(step).max(axis=1) >= 1e-7]  # Newton's next one would be of its square
+        left = left[np.abs(step).max(axis=1) >= 1e-7]  # Newton's next step is of its square
     return xi

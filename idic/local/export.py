@@ -21,12 +21,12 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic
 
 _OFF_PX = 1e-3
-"""From whole pixels, where a code knows no others."""
+"""Largest distance from whole pixels, for codes that know no other points."""
 Columns = dict[str, FloatArray]
 FORMATS = {"ncorr": ".mat", "vic2d": ".csv", "davis": ".txt", "dice": ".txt", "matchid": ".csv",
            "gom": ".csv", "pyvale": ".csv", "csv": ".csv", "mat": ".mat", "npz": ".npz"
            }  # fmt: skip
-"""Suffix of each format, by the names that commands know."""
+"""Suffix of each format, by the format's name in commands."""
 
 
 def export_field(
@@ -38,7 +38,7 @@ def export_field(
     a code that writes millimetres where the size of a pixel isn't known.
 
     grid : the pixels of the reference image.
-    unit : "mm", or "px" where that is what the field's lengths are.
+    unit : unit of the field's lengths, "mm" or "px".
     """
     if form not in FORMATS:
         raise InputError(f"expected a format among {', '.join(FORMATS)}, got {form!r}")
@@ -59,7 +59,7 @@ def export_field(
 
 
 def _numbers(field: LocalField, grid: PixelGrid) -> Columns:
-    """Columns of all points: of those that failed, displacements are NaN; those with 0 are 0."""
+    """Columns of all points; where a point failed u and v are NaN, and "u0" and the like are 0."""
     (row, col), size = grid.to_px(field.x, field.y), grid.pixel_size
     u, v = np.where(field.good, field.u.T, np.nan) / size
     sd = np.zeros(len(u)) if field.sd is None else np.sqrt(np.mean(field.sd**2, axis=1)) / size
@@ -75,7 +75,7 @@ def _numbers(field: LocalField, grid: PixelGrid) -> Columns:
 
 
 def _write_text(path: Path, layout: Mapping[str, Any], numbers: Columns) -> None:
-    """Nothing stands for NaN; the decimal sign is a comma between semicolons."""
+    """Write a table: NaN is left empty; the decimal sign is a comma if semicolons separate."""
     separator, heads = layout["separator"], layout["columns"]
     decimal = "," if separator == ";" else "."
     with atomic(path) as part, part.open("w", encoding="utf-8") as file:
@@ -86,9 +86,9 @@ def _write_text(path: Path, layout: Mapping[str, Any], numbers: Columns) -> None
 
 
 def _lattice(path: Path, field: LocalField, grid: PixelGrid) -> tuple[int, FloatArray]:
-    """Distance of the points [px], and (2, rows, cols) u and v (down) [px], 0 where there are none.
+    """Spacing of the points [px]; (2, rows, cols) u and v (down) [px], 0 where there is no point.
 
-    The first point of the grids is the first pixel, so that the others are whole distances off.
+    The grids start at the first pixel, so that all points are whole spacings from it.
     """
     numbers = _numbers(field, grid)
     places = np.stack([numbers["row"], numbers["col"]])
@@ -123,7 +123,7 @@ def _of_ncorr(path: Path, field: LocalField, grid: PixelGrid, unit: str) -> dict
 
 
 def _of_matlab(field: LocalField) -> Columns:
-    """What modeharvest writes [mm], under names that are variables of MATLAB."""
+    """The columns that modeharvest writes [mm], under names that are valid in MATLAB."""
     sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
     names = ("x_mm", "y_up_mm", "u_mm", "v_up_mm", "sd_u_mm", "sd_v_mm", "valid")
     arrays = (field.x, field.y, *field.u.T, *sd.T, field.good.astype(np.float64))

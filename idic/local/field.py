@@ -1,4 +1,4 @@
-"""Displacement fields at points, read from the files of any DIC code and written.
+"""Displacement fields at points: reading the files of any DIC code, and writing.
 
 A point that failed stays in the field, marked as not valid.
 
@@ -41,7 +41,7 @@ class LocalField:
     """(n, 2) standard deviations of u [mm]; None if not known."""
     source: str = ""
     convention: str = ""
-    """What its file was recognised as, in one sentence; empty if that was declared."""
+    """Recognised convention of its file, in one sentence; empty if that was declared."""
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "u", "sd"):
@@ -72,7 +72,7 @@ class LocalField:
 
     @property
     def read_as(self) -> str:
-        """What its file was taken for, as a sentence."""
+        """A sentence that says by which convention its file was read."""
         return f"{self.source} was read as {self.convention or 'its columns or options say'}."
 
     @property
@@ -125,7 +125,7 @@ class LocalField:
         return self.selected(region.contains(self.x, self.y), "the box")
 
     def selected(self, keep: BoolArray, what: str = "the selection") -> LocalField:
-        """The points that ``keep`` (n,) names; raises InputError if none of them is valid."""
+        """The points where ``keep`` (n,) is True; raises InputError if none of them is valid."""
         if not (keep & self.good).any():
             x, y, _ = self.valid_points()
             raise InputError(
@@ -173,7 +173,7 @@ def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortio
 def field_between(
     before: FloatArray, after: FloatArray, grid: PixelGrid, source: str = ""
 ) -> LocalField:
-    """The displacements from positions (n, 2) (row, col) to others [px]."""
+    """Make the field of displacements from positions (n, 2) to others, both (row, col) [px]."""
     (x, y), (x2, y2) = grid.to_mm(*before.T), grid.to_mm(*after.T)
     return LocalField(x, y, np.column_stack([x2 - x, y2 - y]), source=source)
 
@@ -196,7 +196,7 @@ def read_field(
     """Read a displacement field of any DIC code.
 
     Files of Ncorr, VIC, DaVis, DICe, MatchID, GOM/ZEISS, pyvale and modeharvest are recognised and
-    need no options; what is given counts more than what their code does, see ``formats``.
+    need no options; options that are given override the code's convention, see ``formats``.
     The file's points that are NaN, have ``valid`` zero or a negative ``sigma`` (as VIC and DICe
     mark failure) are kept as not valid. ``sigma`` in pixels is taken for the standard deviation of
     both components. InputError if a column, the units or the axis are not known, or if shapes
@@ -206,14 +206,14 @@ def read_field(
         (cols,) and y (rows,) as axes of grids u and v; VTK or VTU with a vector at its points.
     grid : Pixels to millimetres, needed if anything is in pixels.
     units : "px" or "mm", of positions and displacements; None: as the columns' names state.
-    displacement_units : Of u and v, if they are not those of x and y.
+    displacement_units : Units of u and v, if they are not those of x and y.
     y_axis : "up" or "down": where y grows and v is positive; None: as the columns' names state. In
         pixels, "up" counts from the lowest row.
-    first_pixel : What the code calls the first pixel's centre, 0 or (as MATLAB) 1; None: 0, or as
-        the code that is recognised does.
+    first_pixel : Coordinate of the first pixel's centre, 0 or (as in MATLAB) 1; None: 0, or as in
+        the convention of the code that is recognised.
     columns : Names, or numbers from 1, of columns for "x", "y", "u", "v", "sd_u", "sd_v", "sigma"
-        and "valid", where they can't be known by themselves.
-    frame : Number from 1 of the field in a file of several, as of Ncorr.
+        and "valid", where they aren't recognised by name.
+    frame : Number from 1 of the field in a file that holds several, as Ncorr's.
     """
     found = (read_table(path), None) if columns else recognised(Path(path), units, y_axis, frame)
     table, known = found
@@ -286,7 +286,7 @@ def _declared(
 def _same_shape(
     arrays: list[FloatArray], chosen: dict[str, Column], where: str
 ) -> list[FloatArray]:
-    """(n,) each, from points, grids, or axes and grids; a single frame may lead."""
+    """(n,) each, from points, grids, or axes and grids; an axis of length 1 may come first."""
     x, y, u, v = (np.squeeze(a) for a in arrays)
     if x.ndim == 1 and y.ndim == 1 and u.ndim == 2 and u.shape == (y.size, x.size):
         x, y = np.meshgrid(x, y)
@@ -314,5 +314,5 @@ def _quality(
         sd = scale * np.column_stack([values["sd_u"], values["sd_v"]])
     elif "sigma" in values and in_px:
         sd = scale * np.column_stack([values["sigma"]] * 2)
-    is_known = sd is not None and bool(np.any(np.nan_to_num(sd[ok])))  # 0 is written for none
+    is_known = sd is not None and bool(np.any(np.nan_to_num(sd[ok])))  # zeros mean unknown
     return (sd if is_known else None), ok

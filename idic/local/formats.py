@@ -1,7 +1,7 @@
-"""Conventions of DIC codes: which code wrote a file, and what its numbers mean, from itself.
+"""Conventions of DIC codes: recognises which code wrote a file, and what its numbers mean.
 
-A file is recognised by the names in it or by its first line. What was seen in files of the codes,
-and what is from descriptions only, is said on the documentation's page about fields.
+A file is recognised by the names in it or by its first line. The documentation's page about fields
+says what was seen in files of the codes, and what is known from descriptions only.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _DISPLACEMENTS, _INFO = "data_dic_save/displacements", "data_dic_save/dispinfo/"
 
 @dataclass(frozen=True)
 class Convention:
-    """How a code writes displacements."""
+    """Convention in which a code writes displacements: units, y axis, failed points."""
 
     code: str
     units: str
     displacement_units: str
-    """"px" or "mm", of positions, and of displacements."""
+    """Units of positions and of displacements, "px" or "mm"."""
     y_axis: str
     """"up" or "down": where y grows and v is positive."""
     failed: str = ""
@@ -56,11 +56,11 @@ class Convention:
 def recognised(
     path: Path, units: str | None = None, y_axis: str | None = None, frame: int | None = None
 ) -> tuple[Table, Convention | None]:
-    """The numbers of a file, under the names x, y, u, v, sigma, valid, ... if its code is known.
+    """Read a file's numbers, named x, y, u, v, sigma, valid, ... if its code is recognised.
 
-    ``units``: "px" or "mm", wanted where a file holds both; ``y_axis``: "up" or "down", if it is
+    ``units``: "px" or "mm", to choose where a file holds both; ``y_axis``: "up" or "down", if it is
     declared; ``frame``: number from 1 in a file of several. InputError as for ``read_table``, or if
-    a file has several frames and none is named.
+    a file has several frames and none is chosen.
     """
     if path.suffix.lower() == ".mat" and (found := _ncorr(path, frame)) is not None:
         return found
@@ -84,7 +84,7 @@ def frames_of(path: Path) -> int:
 
 @cache
 def layouts() -> dict[str, Any]:
-    """What ``formats.toml`` says of columns."""
+    """The names of columns by code, from ``formats.toml``."""
     text = resources.files(__package__).joinpath("formats.toml").read_text("utf-8")
     return tomllib.loads(text.replace("MM", r"( ?[\\[(]mm[\\])])?"))
 
@@ -100,7 +100,7 @@ def _by_names(path: Path, table: Table, units: str | None, y_axis: str | None) -
 
 
 def _named(table: Table, patterns: Mapping[str, str]) -> Table | None:
-    """Columns by the patterns that their names match wholly; None if one is missing."""
+    """Columns whose names match the patterns as a whole; None if one is missing."""
     found = {}
     for role, pattern in patterns.items():
         names = [n for n in table if re.fullmatch(pattern, n.strip(), re.IGNORECASE)]
@@ -133,14 +133,14 @@ def _matchid(path: Path, table: Table, units: str | None, y_axis: str | None) ->
 
 
 def _runs_against(y: FloatArray, row: FloatArray) -> bool:
-    """Whether positions grow where rows fall: the file itself shows where its y grows."""
+    """Whether y grows where rows decrease: the file itself shows the direction of its y axis."""
     y, row = np.ravel(y), np.ravel(row)
     good = np.isfinite(y) & np.isfinite(row)
     return bool(good.sum() > 1 and np.cov(y[good], row[good])[0, 1] < 0.0)
 
 
 def _vic(path: Path, table: Table, units: str | None, y_axis: str | None) -> Known:
-    """Lower case is in pixels; of millimetres, capitals are VIC-3D's, x_c is VIC-2D's."""
+    """Lower-case names are in pixels; in millimetres VIC-3D uses capitals, VIC-2D x_c."""
     sigma = _named(table, {"sigma": r"sigma( \[pixel\])?"})
     if sigma is None:
         return None
@@ -164,7 +164,7 @@ def _cased(table: Table, *patterns: tuple[str, str]) -> Table | None:
 
 
 def _own(path: Path, table: Table, units: str | None, y_axis: str | None) -> Known:
-    """What modeharvest measured at the nodes of a mesh."""
+    """Displacements that modeharvest measured at the nodes of a mesh."""
     if not {"nodes", "cells", "displacement", "standard_deviation"} <= set(table):
         return None
     with open_hdf5(path, "a measured displacement (HDF5)", "measure again") as file:
@@ -200,7 +200,7 @@ def _davis(path: Path, table: Table, units: str | None, y_axis: str | None) -> K
 
 
 def _ncorr(path: Path, frame: int | None) -> Known:
-    """One displacement field of a file that Ncorr has saved; None for other files."""
+    """Read one displacement field of a file saved by Ncorr; None for other files."""
     frames, info = _ncorr_frames(path)
     if not frames:
         return None
@@ -238,7 +238,7 @@ def _ncorr_frames(path: Path) -> tuple[list[Table], Table]:
 
 
 def _in_version_73(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays by their path, as in older versions; those of several frames are referred to."""
+    """Arrays by their path, as in older versions; references to several frames are followed."""
     found = {}
     with open_hdf5(path, "a displacement field of Ncorr", "save it again") as file:
         for group in (_DISPLACEMENTS, _INFO):

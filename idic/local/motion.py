@@ -75,8 +75,8 @@ def fit_unknowns(
 ) -> RobustFit:
     """Fit v0, and every v_i, to displacements at points; the modes are fixed.
 
-    The unknowns ``a`` (size,) are those of the modes' parameters. Higher degrees than those given
-    are zero. Raises InputError if there are fewer components than coefficients.
+    ``a`` (size,) gives the modes' parameters; coefficients above the given degrees are set to zero.
+    Raises InputError if there are fewer components than coefficients.
     """
     a = ansatz.checked(a).copy()
     stride = max(1, -(-int(field.good.sum()) // MOST_POINTS))
@@ -95,20 +95,20 @@ def fit_unknowns(
 
 
 def _low_orders(ansatz: Ansatz, v0_degree: int, v_degree: int) -> NDArray[np.intp]:
-    """Where v0 and v_i up to these degrees are among the unknowns."""
+    """Indices of v0 and v_i up to these degrees among the unknowns."""
     v0, v = (np.arange(len(orders(degree))) for degree in (v0_degree, v_degree))
     places = [ansatz.v0_slice(c).start + v0 for c in (0, 1)]
     return np.concatenate(places + [ansatz.v_slice(m).start + v for m in range(len(ansatz.modes))])
 
 
 SLOW_DEGREE = 3
-"""Total degree of v0 in an initial guess, at most: what bends and barrels, but not cell by cell."""
+"""Highest total degree of v0 in an initial guess: bending and barrelling, nothing cell by cell."""
 Slow = Callable[[FloatArray], FloatArray]
-"""From (..., 2) points to (..., 2) displacements [mm]."""
+"""From points (..., 2) to displacements (..., 2) [mm]."""
 
 
 def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tuple[Slow, str]:
-    """Find the slow motion from what the images' geometry shows, and a sentence about it.
+    """Find the slow motion from the images' geometry, and a sentence about it.
 
     From the displacements of the holes' centres, by polynomials over the domain [mm], or from the
     boundaries in the masks.
@@ -130,7 +130,7 @@ def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tupl
 def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
     """A polynomial through the holes' displacements; None if there are too few for a plane."""
     count = int(holes.good.sum())
-    # Three points a coefficient.
+    # At least three points per coefficient.
     fitting = [d for d in range(1, SLOW_DEGREE + 1) if 3 * (d + 1) * (d + 2) // 2 <= count]
     if not fitting:
         return None
@@ -166,18 +166,18 @@ def edge_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -> F
 
 
 CELL_PX = 48
-"""Binned pixels a unit cell: enough to see its pattern, few enough to be quick."""
+"""Binned pixels per unit cell: enough to see its pattern, few enough to be quick."""
 BLUR = 2.0
-"""Of the binned images [binned px]."""
+"""Standard deviation of the blur of the binned images [binned px]."""
 RADIUS = 7
-"""Of a window [binned px]."""
+"""Radius of a Lucas–Kanade window [binned px]."""
 WARPS = 4
 """Iterations on each level of the flow's own pyramid; more mend a few stray points alone."""
 STEP = 2
-"""Distance of the field's points [binned px]."""
+"""Spacing of the field's points [binned px]."""
 DITHER = 1e-3
-"""Noise added to both images, of their contrast: a window without any texture has no flow at all,
-and what it gives instead would spread."""
+"""Noise added to both images, over their contrast: a window without any texture has no flow at all,
+and the value found there instead would spread."""
 
 
 def coarse_field(pair: ImagePair, cell_size: float, known: Slow) -> LocalField:
@@ -207,7 +207,7 @@ def coarse_field(pair: ImagePair, cell_size: float, known: Slow) -> LocalField:
 
 
 def _warped_back(level: LevelPair, slow: FloatArray) -> tuple[NDArray[Any], BoolArray]:
-    """(rows, cols) g at x + slow, the reference where that is outside; and where it is inside."""
+    """(rows, cols) g at x + slow, or the reference where that is outside; and where it is in g."""
     grid = level.grid
     row, col = np.indices(grid.shape)
     to_row, to_col = row - slow[..., 1] / grid.pixel_size, col + slow[..., 0] / grid.pixel_size

@@ -15,7 +15,7 @@ import numpy as np
 
 
 def run(folder: Path) -> None:
-    """Correlate what ``request.npz`` in the folder asks for."""
+    """Run the correlation that ``request.npz`` in the folder specifies."""
     with np.load(folder / "request.npz") as request:
         reference, deformed, mask = (request[name] for name in ("f", "g", "mask"))
         arguments = json.loads(str(request["arguments"]))

@@ -1,10 +1,10 @@
 """Subset DIC by pyvale, an optional library, with predicted standard deviations.
 
 pyvale (https://github.com/Computer-Aided-Validation-Laboratory/pyvale, MIT) matches subsets by
-their zero-normalised difference, starts from Fourier correlations of windows that become smaller,
-and goes from the best matched subset to its neighbours. It is installed apart: with the libraries
-for windows and meshes that it asks for it weighs 2 GB. It runs in a process of its own, so that
-neither its threads nor a crash in it are felt here.
+their zero-normalised difference, starts from Fourier correlations of ever smaller windows, and
+proceeds from the best matched subset to its neighbours. It is installed separately: with the
+graphics and mesh libraries that it requires it takes 2 GB. It runs in a separate process, so that
+neither its threads nor a crash affect this one.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def predicted_sd(
     correlation: FloatArray,
     subset_px: int,
 ) -> FloatArray:
-    """Standard deviations that the residual predicts, (n, 2) [mm].
+    """Standard deviations (n, 2) of u that the residual predicts [mm].
 
     The zero-normalised correlation C (n,) of a subset gives its residual, 2 (1 − C) of the images'
     variance. Were it white noise, the displacement's covariance would be that times (Σ ∇f ∇fᵀ)⁻¹
@@ -89,11 +89,11 @@ HOW_TO_GET = (
     "there (see docs/how-to/fields.md), or read the field of another code"
 )
 _TRIES = 3
-"""Seeds that are tried."""
+"""Number of seeds that are tried."""
 _SHARES = (1.0, 0.8, 1.25)
-"""Of the largest motion, that are tried with each: some sizes of the first window fail."""
+"""Factors on the largest motion, tried with each seed: some sizes of the first window fail."""
 _MOST, _MARGIN = 0.998, 1.1
-"""Share of a rough field's points that move less than its largest motion, and what that lacks."""
+"""Share of a rough field's points that move less than the largest motion; margin on that."""
 _COARSE_PX = 400
 """Pixels across that are enough for a rough field."""
 _SIDE = Path(__file__).with_name("pyvale_side.py")
@@ -101,7 +101,7 @@ _SIDE = Path(__file__).with_name("pyvale_side.py")
 
 @dataclass(frozen=True)
 class SubsetOptions:
-    """How to correlate subsets."""
+    """Options of a subset DIC."""
 
     subset_px: int = 21
     """Edge of a subset, odd [px]: at least three speckles across."""
@@ -115,10 +115,10 @@ class SubsetOptions:
     """Least share of a subset that is material [-]. pyvale takes the pixels of a hole for speckle,
     so at less than 1 there are more subsets at holes, and they are worse."""
     largest_px: int | None = None
-    """Largest motion along either axis [px]; None: looked up in the images' ``coarse_field``.
+    """Largest motion along either axis [px]; None: estimated from the images by ``coarse_field``.
     pyvale's first windows are twice as large, and fail if they are much larger than need be."""
     threads: int | None = None
-    """For pyvale; None: all cores."""
+    """Number of threads of pyvale; None: all cores."""
 
     def __post_init__(self) -> None:
         if self.subset_px < 5 or self.subset_px % 2 == 0 or not 1 <= self.step_px <= self.subset_px:
@@ -223,7 +223,7 @@ def _arguments(
 
 
 def _run(python: str, folder: Path, pair: ImagePair, arguments: dict[str, Any]) -> str:
-    """Run pyvale once; the last line of its error output if it fails."""
+    """Run pyvale once; returns the last line of its error output, for the case that it fails."""
     f, g = pair.reference, pair.deformed
     low, high = min(f.min(), g.min()), max(f.max(), g.max())
     f, g = ((255.0 * (i - low) / (high - low)).astype(np.float32) for i in (f, g))

@@ -28,9 +28,9 @@ _VECTORS = ("u", "displacement", "disp", "displacements")
 _MISSING = {"", "-", "--", "---", "na", "n/a", "nan", "null", "none"}
 _WHAT, _REMEDY = "a displacement field", "export it again, best as CSV"
 _BYTES_OF_TEXT = 10.0
-"""Most that a character of a table of numbers becomes in memory."""
+"""Most bytes in memory for a character of a table of numbers."""
 _HEAD = 1000
-"""Lines of a text among which the first line of numbers is looked for."""
+"""Lines of a text in which the first line of numbers is searched."""
 _BENCHMARK = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 _LOGICAL = {"true": 1.0, "false": 0.0}
 
@@ -67,7 +67,7 @@ def _read_text(path: Path) -> Table:
     separator, decimal = _dialect(numbered[first][1])
     names = _split(numbered[first - 1][1], separator) if first else []
     while names and not names[-1]:
-        names.pop()  # of a separator at the end of the line
+        names.pop()  # due to a separator at the end of the line
     row = _split(numbered[first][1], separator)
     if len(names) != len(row) - (not row[-1]) and len(names) != len(row):
         names = [str(k + 1) for k in range(len(row))]  # to be called by their number
@@ -78,7 +78,7 @@ def _read_text(path: Path) -> Table:
 
 
 def _numbered(path: Path, begin: int = 1, end: int | None = _HEAD) -> list[tuple[int, str]]:
-    """Numbers and content of the lines that hold something, from one to another."""
+    """Numbers and contents of the lines that aren't empty, from ``begin`` to ``end``."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         lines = islice(enumerate(file, start=1), begin - 1, end)
         stripped = ((k, line.strip().lstrip("#%").strip()) for k, line in lines)
@@ -86,7 +86,7 @@ def _numbered(path: Path, begin: int = 1, end: int | None = _HEAD) -> list[tuple
 
 
 def _numbers_at_once(path: Path, begin: int, separator: str | None) -> FloatArray | None:
-    """(n, m) of a table of nothing but numbers, fast; None if there is anything else."""
+    """(n, m) values of a table of nothing but numbers, fast; None if there is anything else."""
     try:
         return np.loadtxt(
             path, delimiter=separator, comments=None, skiprows=begin - 1, ndmin=2,
@@ -99,7 +99,7 @@ def _numbers_at_once(path: Path, begin: int, separator: str | None) -> FloatArra
 def _numbers_by_line(
     path: Path, begin: int, separator: str | None, decimal: str, width: int
 ) -> FloatArray:
-    """(n, width) line by line, to name the line that holds something else."""
+    """(n, width) values, read line by line to name a line that holds anything else."""
     rows = [(k, _split(line, separator)) for k, line in _numbered(path, begin, None)]
     for k, row in rows:
         if len(row) - width not in (0, 1) or any(row[width:]):
@@ -179,7 +179,7 @@ def read_mat(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def claimed_benchmark(path: Path) -> str | None:
-    """The id that a file itself says it belongs to; None if it says none or can't be read."""
+    """Id of the benchmark that a file says it belongs to; None if it says none or can't be read."""
     suffix, text = path.suffix.lower(), ""
     with suppress(InputError), reading(path, _WHAT):  # who reads the field says what is wrong
         if suffix in TEXTS:
@@ -341,7 +341,7 @@ def choose(
 
 
 def _narrowed(candidates: list[Column], units: str | None) -> list[Column]:
-    """Drop what is in another unit."""
+    """Drop columns in another unit."""
     if len(candidates) == 1 or units is None:
         return candidates
     fitting = [c for c in candidates if c.unit in (units, None)] or candidates

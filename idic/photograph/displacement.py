@@ -1,7 +1,7 @@
-"""The whole displacement of one photograph: its start, its brightness, its mask, its measurement.
+"""The whole displacement of one photograph: initial guess, brightness, mask, measurement.
 
-Nothing is typed in: blocks of the speckle give the motion to a pixel, and with the mask of the
-reference a first measurement gives that of the deformed image.
+No number is typed in: blocks of the speckle give the motion to a pixel, and a first measurement
+with the mask of the reference gives the mask of the deformed image.
 """
 
 from __future__ import annotations
@@ -47,45 +47,45 @@ from modeharvest.util.masks import shrunk
 from modeharvest.util.progress import Progress, silent
 
 _FAR_PX = 4 * REACH_PX
-"""How far blocks are looked for where they aren't near."""
+"""How far blocks are searched where they aren't found nearby."""
 _ENOUGH = 0.9
-"""Share of blocks that are near, unless some have gone far."""
+"""Share of blocks that are found nearby, unless some have moved far."""
 _CLOSE_PX = 1.5
-"""What a polynomial may leave of nine tenths of the blocks' motion."""
+"""Largest residual of a polynomial for nine tenths of the blocks' motion."""
 _DENSER = 5, 16
-"""Times as many blocks, in turn, that are asked: the widest places are junctions, which only turn.
+"""Factors by which blocks are more, in turn: the widest places are junctions, which only turn.
 """
 _SMOOTH_PX = 60.0
-"""Shorter waves of a start are what a spline makes of whole pixels, and would stay."""
+"""Shorter waves of an initial guess come from motions in whole pixels, and would remain."""
 _FEW, _MANY = 1.3, 4.0
-"""Times the shortest wave of its start from which on a cut-off asks for a smoother start, and over
-how many cut-offs that one is smoothed, unless the images ask for a shorter cut-off then."""
+"""Ratio of cut-off to shortest wave of the initial guess from which on a smoother one is tried, and
+over how many cut-offs that one is smoothed, unless the images then require a shorter cut-off."""
 _STRAY = 8.0
-"""Times the spread of its neighbours' motion that a block may be off their median."""
+"""Largest difference of a block's motion from its neighbours' median, over their spread."""
 _FIRST = FiniteElementOptions(edge_px=4)
-"""Of the measurement that only the deformed image's mask is taken from."""
+"""Options of the measurement from which only the deformed image's mask is taken."""
 _LAST = FiniteElementOptions(edge_px=1)
 """A camera's pixel on an edge shows some background; one such row lets the edge drift off."""
 _BLUR_PX, _SPECKLE = 1.5, 3.0
-"""Of the reference, and the power of its slopes over that of noise, where there is speckle."""
+"""Blur of the reference, and least power of its slopes, over that of noise, with speckle."""
 _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which they don't match."""
 _OFF_PX, _AT_EDGE_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0), 1.0
-"""By how much edges may be off where blocks of speckle say, and as many measurements as it takes
-until the images match everywhere, or no better; and the last one."""
+"""Possible error of edges after blocks of speckle, one for each first measurement (repeated until
+the images match everywhere, or no better), and before the last measurement."""
 _UNLIKE, _ROUNDS = 4.5, 4
 """Residual over its median, 3 standard deviations of noise, beyond which pixels don't match."""
 _SAMPLES, _LEAST = 100_000, 0.1
-"""Pixels that tell how brightness varies; least contrast anywhere, of the mean."""
+"""Pixels from which brightness is fitted; least gain anywhere, over the mean."""
 
 
 def displacement_from(
     start: FloatArray, pair: ImagePair, body: Body, options: FiniteElementOptions = _LAST,
     progress: Progress = silent, light_degree: int = 0,
 ) -> NodalResult:  # fmt: skip
-    """Measure the displacement of a photograph on a mesh, from a start (n, 2) at its nodes [mm].
+    """Measure a photograph's displacement on a mesh, from an initial guess (n, 2) at nodes [mm].
 
-    ``pair``: the mask of the reference; brightness may differ. InputError if the images don't
+    ``pair``: with the mask of the reference; brightness may differ. InputError if the images don't
     overlap; and as for :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
     ``light_degree``: of the polynomials by which gain and offset vary over the reference.
     """
@@ -93,7 +93,7 @@ def displacement_from(
     is_sought = pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None
 
     def seen(off_px: float) -> ImagePair:
-        """The images alike, less what shows background where edges are off by so much."""
+        """The images, equally bright, without what shows background if edges are off this much."""
         pair_alike = alike(pair, mesh, u, light_degree)
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(pair_alike, deformed_mask=mask)
@@ -101,7 +101,7 @@ def displacement_from(
     unknown = len(start)
     for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
         u, known = coarse_displacement(seen(off_px), start, body, options=_FIRST)
-        # Where the images don't match it is tried again from where the neighbours are.
+        # Where the images don't match, the next attempt starts from the neighbours' displacement.
         start = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
         before, unknown = unknown, int((~known).sum())
         if sweep and not 0 < unknown < before:
@@ -111,7 +111,7 @@ def displacement_from(
     found = measured(pair_alike, start)
     if found.cutoff_px is None or found.cutoff_px < _FEW * _SMOOTH_PX:
         return found
-    # Shorter waves of the start are noise of the same images, which nothing would count.
+    # Shorter waves of the start are noise of the same images, which no error estimate would count.
     wave = found.cutoff_px * pair.grid.pixel_size
     smoother = measured(pair_alike, body.smoothed(start, _MANY * wave))
     if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
@@ -120,7 +120,7 @@ def displacement_from(
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:
-    """The islands of a mask that show speckle in an image (rows, cols), and what of it doesn't.
+    """Select the islands of a mask that show speckle in an image (rows, cols); text on the others.
 
     The mask is True on material. Slopes of speckle are compared with those of the image's noise,
     both blurred, because few speckles are as small as pixels. InputError if there is none.
@@ -149,11 +149,11 @@ def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, 
 def block_motion(
     pair: ImagePair, body: Body, known: FloatArray, names: Sequence[str] = ()
 ) -> FloatArray:
-    """(n, 2) displacement of the nodes [mm] to some pixels: what is known, and what blocks moved.
+    """(n, 2) displacement of the nodes [mm] to some pixels: ``known`` and the motion of blocks.
 
-    A polynomial is fitted to what blocks of the speckle have moved beyond a known displacement
-    (n, 2); where that isn't close to them, a spline through more of them takes its place.
-    InputError if they aren't found.
+    A polynomial is fitted to the motion of speckle blocks relative to a known displacement (n, 2);
+    if that isn't close to them, a spline through more of them is added. InputError if the blocks
+    aren't found.
     """
     mesh = body.mesh
     match = _matched(pair, mesh, known, BLOCKS)
@@ -186,14 +186,14 @@ def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:
 
 
 def _matched(pair: ImagePair, mesh: Mesh, u: FloatArray, count: int) -> BlockMatch:
-    """Blocks, looked for around where displacements u (n, 2) of the nodes [mm] take them."""
+    """Match blocks, searched around where displacements u (n, 2) of the nodes [mm] take them."""
     expected = expected_by(_at_nearest(mesh, u), pair.grid)
     near = match_blocks(pair, expected, REACH_PX, count)
     return near if near.share >= _ENOUGH else match_blocks(pair, expected, _FAR_PX, count)
 
 
 def _at_nearest(mesh: Mesh, u: FloatArray) -> Slow:
-    """Displacements u (n, 2) of the nodes [mm] anywhere: those of the nearest node."""
+    """Extend displacements u (n, 2) of the nodes [mm] to any point, by the nearest node's."""
     tree = cKDTree(mesh.nodes)
     return lambda points: np.asarray(u[tree.query(points)[1]])
 
@@ -212,7 +212,7 @@ def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) ->
 
 
 def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
-    """The pair with brightness and contrast alike, in the reference's levels; u (n, 2) [mm]."""
+    """Make brightness and contrast of the pair equal, in the reference's levels; u (n, 2) [mm]."""
     at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
     gain, offset = brightness(pair, np.moveaxis(at, 0, -1), degree)
     a, b = gain.mean(), offset.mean()
@@ -223,8 +223,8 @@ def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
 def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatArray, FloatArray]:
     """Gain [-] and offset [grey levels], (rows, cols), that make g(x + u) as bright as f.
 
-    Polynomials of a degree, with which both images have the same mean and the same contrast: so a
-    displacement that is off by some pixels hardly matters. Edges and what doesn't match don't
+    Polynomials of total degree ``degree`` that give both images the same mean and contrast: so a
+    displacement that is off by some pixels hardly matters. Edges and pixels that don't match don't
     count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known.
     """
     grid, inner = pair.grid, shrunk(pair.masks[0], _OFF_PX[0])
@@ -251,7 +251,7 @@ def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatAr
 
 
 def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
-    """(rows, cols) f - gain g(x + u) - offset [grey levels]; NaN off the material and the image."""
+    """(rows, cols) f - gain g(x + u) - offset [grey levels]; NaN outside material and image."""
     gain, offset = brightness(pair, u, degree)
     known = pair.masks[0] & np.isfinite(u).all(axis=-1)
     f, g = _compared(pair, u, known)
@@ -261,7 +261,7 @@ def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
 
 
 def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple[str, ...]:
-    """A warning if images don't match somewhere: the residual is more than noise and than slight.
+    """Warn if images don't match somewhere: the residual is above noise, and not slight.
 
     ``noise``: of the residual, rms; ``reference``: (p,) pixels of its material [grey levels].
     """

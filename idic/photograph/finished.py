@@ -1,4 +1,4 @@
-"""Displacements that a run has left in its folder, with their photographs: read, and exported."""
+"""Displacements of a finished run, with their photographs: read from its folder, and exported."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from modeharvest.util.typed import nearest
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What ``measure``, ``harvest`` or ``run`` has left in a folder."""
+    """Results of ``measure``, ``harvest`` or ``run`` in a folder."""
 
     files: dict[str, Path]
-    """Of the displacements (HDF5), by the names of the images, in the order of the test."""
+    """Files of the displacements (HDF5), by image name, in the order of the test."""
     pictures: dict[str, Path]
-    """Photographs, of those names that have one."""
+    """Photographs by image name, where there is one."""
     unit: str
-    """Of lengths, "mm" or "px"."""
+    """Unit of lengths, "mm" or "px"."""
 
     @classmethod
     def read(cls, place: Path | str, photographs: Sequence[Path] = ()) -> FinishedRun:
-        """Open a run's folder, or a file; ``photographs`` of all images, if others than the run's.
+        """Open a run's folder, or a file; ``photographs``: of all images, if not the run's own.
 
         InputError if nothing was measured there.
         """
@@ -66,14 +66,14 @@ class FinishedRun:
         return nodal.read_result(self.files[name], with_roots=True)
 
     def picture(self, name: str) -> FloatImage | None:
-        """(rows, cols) an image's photograph from 0 black to 1 white; None where it has none."""
+        """The photograph of an image, (rows, cols), 0 black to 1 white; None if there is none."""
         if (path := self.pictures.get(name)) is None:
             return None
         photograph = read_photograph(path)
         return np.asarray(photograph.image / np.float32(photograph.full_scale))
 
     def component(self, image: str, name: str) -> tuple[FloatArray, str]:
-        """(n,) a field's component at the nodes by its name, and its unit; InputError for others.
+        """A field's component at the nodes (n,), and its unit; InputError for an unknown name.
 
         Names are u, v, sd_u, rotation, stretch_1, logarithmic_xx, ...
         """
@@ -83,9 +83,9 @@ class FinishedRun:
         return known[name]
 
     def export(self, form: str, folder: Path, step: int) -> list[Path]:
-        """Write all displacements as ``local.export.FORMATS``, at every ``step``-th pixel.
+        """Write all displacements in one of ``local.export.FORMATS``, every ``step``-th pixel.
 
-        With all fields that follow: "csv" (at nodes), "hdf5", "vtu", "tiff", "mat" (maps).
+        The forms with all derived fields are "csv" (at nodes), "hdf5", "vtu", "tiff", "mat" (maps).
         """
         given, written = nodal.Given(self.unit), list[Path]()
         make_folder(folder)
@@ -116,7 +116,7 @@ _WHOLE: dict[str, tuple[str, Callable[..., None]]] = {
 
 
 def at_pixels(result: NodalResult, step: int) -> LocalField:
-    """u and its standard deviation at the material's pixels whose row and column are multiples."""
+    """u and its standard deviation at the material's pixels in every ``step``-th row and column."""
     row, col = np.mgrid[0 : result.grid.rows : step, 0 : result.grid.cols : step].reshape(2, -1)
     points = np.column_stack(result.grid.to_mm(row, col))
     u = result.at(points)

@@ -1,7 +1,7 @@
 """Gauges in measured displacements: at points, along lines (extensometers), over areas.
 
-A gauge's variance is what each root of all nodes' covariance (``NodalResult.roots``) changes in its
-reading, squared and summed: what neighbours have in common counts as it does in a mean.
+A gauge's variance is the sum of squares of what each root of the covariance of all nodes
+(``NodalResult.roots``) changes in its reading: correlation between neighbours is included.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from modeharvest.util.files import reading, write_csv
 from modeharvest.util.typed import made
 
 _MOST_POINTS = 2000
-"""Of an area."""
+"""Most points of an area."""
 _ALONG_PX = 2.0
-"""Between points of a line."""
+"""Distance between points of a line [px]."""
 _DEGREES = {"rotation": "deg", "turn": "deg"}
 Position = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """A gauge: a ``point``, a ``line`` between two, or a ``polygon``, one of the three.
+    """A gauge: either a ``point``, a ``line`` between two points, or a ``polygon``.
 
     Positions are in the unit of the result, x right and y up from its origin (of ``measure``: the
     middle of the image); with ``pixels`` they are [column, row] as an image viewer shows, from 0.
@@ -76,11 +76,11 @@ class GaugeReading(NamedTuple):
 
 
 Readings = dict[str, GaugeReading]
-"""By the names of what was read."""
+"""Readings by the name of the quantity."""
 
 
 def read_gauges(path: Path | str) -> tuple[Gauge, ...]:
-    """Gauges of a TOML file's tables [[gauges]]; InputError if there are none, or one is wrong."""
+    """Read [[gauges]] from a TOML file; InputError if there are none, or one is wrong."""
     with reading(path, "gauges (TOML)", "write [[gauges]] with name and point, line or polygon"):
         tables = tomllib.loads(Path(path).read_text("utf-8")).get("gauges")
     if not tables:
@@ -101,12 +101,12 @@ def distinct(gauges: Iterable[Gauge]) -> tuple[Gauge, ...]:
 
 
 def read_at(gauge: Gauge, result: NodalResult, unit: str = "mm") -> Readings:
-    """What a gauge reads in a displacement, with standard deviations (NaN where it has no roots).
+    """Read a gauge in a displacement, with standard deviations (NaN if that has no roots).
 
-    A point, and the mean over an area's material: u, v, logarithmic strains, rotation
-    (counter-clockwise), principal stretches, J. A line: its length, the engineering strain l/L - 1
-    and the logarithmic one of its ends, its turn, and the mean of the stretch along it less 1.
-    InputError if a point or an end is beside the material, or nothing of an area is on it.
+    A point, and the mean over an area's material, give u, v, logarithmic strains, rotation
+    (counter-clockwise), principal stretches, J. A line gives its length, the engineering strain l/L
+    - 1 and the logarithmic strain of its ends, its turn, and the mean stretch along it less 1.
+    InputError if a point or an end is beside the material, or no part of an area is on it.
     """
     points, (u, *du), (F, *dF) = _at(gauge, result)
     of, names = (_of_line, _LINE) if gauge.line else (_mean, _MEAN)
@@ -119,7 +119,7 @@ def read_at(gauge: Gauge, result: NodalResult, unit: str = "mm") -> Readings:
 
 
 def along(gauge: Gauge, result: NodalResult) -> FloatArray:
-    """(k, 6) of a line: distance from its first end, x, y, u, v, stretch along the line less 1."""
+    """(k, 6) along a line: distance from its first end, x, y, u, v, stretch along it less 1."""
     points, (u, *_), (F, *_) = _at(gauge, result)
     s = np.linalg.norm(points - points[0], axis=1)
     return np.column_stack([s, points, u, _stretch(points, F) - 1.0])
@@ -145,7 +145,7 @@ def _of_line(points: FloatArray, u: FloatArray, F: FloatArray) -> FloatArray:
 
 
 def _stretch(points: FloatArray, F: FloatArray) -> FloatArray:
-    """(p,) of a line at its points."""
+    """(p,) stretch along a line at its points [-]."""
     before = points[-1] - points[0]
     return np.asarray(np.linalg.norm(F @ (before / np.linalg.norm(before)), axis=1))
 
@@ -153,8 +153,8 @@ def _stretch(points: FloatArray, F: FloatArray) -> FloatArray:
 def points_of(gauge: Gauge, grid: PixelGrid, mesh: Mesh) -> FloatArray:
     """(p, 2) points where a gauge reads [mm]; a line's ends are the first and the last one.
 
-    Of an area those on the mesh. InputError if a point or an end is beside the material, or
-    nothing of an area is on it.
+    Of an area only those on the mesh. InputError if a point or an end is beside the material, or no
+    part of an area is on it.
     """
     corners, pixel = gauge.corners(grid), grid.pixel_size
     if gauge.line:
@@ -182,7 +182,7 @@ def points_of(gauge: Gauge, grid: PixelGrid, mesh: Mesh) -> FloatArray:
 
 
 def _at(gauge: Gauge, result: NodalResult) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(p, 2) points, (1 + k, p, 2) u and (1 + k, p, 2, 2) F there: the result's and its roots'."""
+    """Points (p, 2); there u (1 + k, p, 2) and F (1 + k, p, 2, 2) of the result and its k roots."""
     points = points_of(gauge, result.grid, result.mesh)
     found = result.at(points, _nodal(result))
     F = np.moveaxis(found[..., 1:, :], -1, 0)
@@ -192,7 +192,7 @@ def _at(gauge: Gauge, result: NodalResult) -> tuple[FloatArray, FloatArray, Floa
 
 @lru_cache(maxsize=1)
 def _nodal(result: NodalResult) -> FloatArray:
-    """(n, 2, 3, 1 + k) displacement and its roots at the nodes, each with its gradient behind."""
+    """(n, 2, 3, 1 + k) displacement and its roots at the nodes, each followed by its gradient."""
     u = result.displacement[..., None]
     u = u if result.roots is None else np.concatenate([u, result.roots], axis=2)
     slopes = nodal_gradient(result.mesh, u.reshape(len(u), -1)).reshape(*u.shape, 2)
@@ -200,7 +200,7 @@ def _nodal(result: NodalResult) -> FloatArray:
 
 
 def reading_rows(readings: Mapping[str, Mapping[str, Readings]]) -> list[dict[str, Any]]:
-    """What :func:`write_gauges` returns as rows ``image gauge reads value sd unit``."""
+    """Convert what :func:`write_gauges` returns to rows ``image gauge reads value sd unit``."""
     return [
         {"image": image, "gauge": gauge, "reads": what, **reading._asdict()}
         for image, own in readings.items()
@@ -211,9 +211,9 @@ def reading_rows(readings: Mapping[str, Mapping[str, Readings]]) -> list[dict[st
 def write_gauges(
     folder: Path, gauges: Sequence[Gauge], results: Iterable[tuple[str, NodalResult]], unit: str
 ) -> dict[str, dict[str, Readings]]:
-    """Read gauges in every image's result; leaves gauges.csv and gauges_along.csv, of lines.
+    """Read gauges in every image's result; writes gauges.csv and, for lines, gauges_along.csv.
 
-    Returns what each gauge reads by its name, by the images' names.
+    Returns the readings, by the images' names, then by the gauges' names.
     """
     readings, lines = dict[str, dict[str, Readings]](), list[tuple[Any, ...]]()
     for name, result in results:

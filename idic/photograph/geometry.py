@@ -63,18 +63,18 @@ class RegionTable:
 
 @dataclass(frozen=True)
 class SpecimenTable:
-    """What is known of the specimen beforehand."""
+    """Prior knowledge of the specimen: cell size, cellular part, material, regions."""
 
     cell_size: float = math.nan
     """l [mm], the distance of neighbouring holes."""
     polygon: Corners = ()
     """Corners (column, row) of the cellular part in the reference [px]; else found from holes."""
     cells: str = ""
-    """Or a mask image of the cellular part, white inside."""
+    """Mask image of the cellular part, white inside; instead of a polygon."""
     material: str = ""
     """Mask image of the reference's material, white on it; found from the image otherwise."""
     deformed_material: tuple[str, ...] = ()
-    """The same of each deformed image, in their order; names may hold wildcards."""
+    """Mask images of the material in the deformed images, in order; names may hold wildcards."""
     regions: tuple[RegionTable, ...] = ()
     """Parts of the cellular part whose patterns differ; by default it has one pattern."""
 
@@ -112,7 +112,7 @@ class Region:
     domain: Box
     """Box around all material in the image [mm]."""
     text: tuple[str, ...]
-    """Where the region comes from, and what is odd about it."""
+    """How the region was found, and what is unusual about it."""
 
 
 def region_of_lattice(lattice: HoleLattice, mask: ArrayLike, grid: PixelGrid) -> Region:
@@ -187,7 +187,7 @@ def _region(
     if any(cut):
         sides = ", ".join(side for side, outside in zip(SIDES, cut, strict=True) if outside)
         text = (*text, f"The specimen leaves the image at the {sides}.")
-    # Half a cell of rounding or of a crooked edge must not make the domain the smaller one.
+    # Half a cell of rounding, or a crooked edge, must not make the domain smaller than the part.
     domain = _box(np.minimum(low, least), np.maximum(high, most), grid)
     return Region(_box(low, high, grid), domain, text)
 
@@ -238,7 +238,7 @@ def _unlike_box(inside: BoolArray, low: FloatArray, high: FloatArray) -> list[st
 
 _UPRIGHT_DEG = 1.0
 _OVERLAP = 0.5
-"""Cells by which the boxes of two parts may overlap; so wide are the tapers of their modes."""
+"""Largest overlap of the boxes of two parts [cells]: the width of their modes' tapers."""
 
 
 _FEW = (
@@ -255,7 +255,7 @@ class Geometry:
     mask: BoolArray
     """(rows, cols) True on material."""
     lattice: HoleLattice | None
-    """Of the holes; None where there is none and the region was given."""
+    """Lattice of the holes; None where there is none and the region was given."""
     region: Region
     parts: Mapping[str, Box]
     """Boxes around the parts with modes of their own, by name [mm]; by default the whole cellular
@@ -277,7 +277,7 @@ class Geometry:
         return np.asarray(np.column_stack([col, -row]) * self.grid.pixel_size)
 
     def few_cells(self, cell_size: float) -> tuple[str, ...]:
-        """What to warn of if a part has too few cells [mm] across for its wave vectors."""
+        """Warnings if a part has too few cells [mm] across for its wave vectors."""
         across = min(cells_across(box, cell_size) for box in self.parts.values())
         return (_FEW.format(across, FEWEST_CELLS),) * (round(across) < FEWEST_CELLS)
 
@@ -304,7 +304,7 @@ def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: 
 
 
 def _no_pattern(mask: BoolArray, grid: PixelGrid, error: InputError) -> InputError:
-    """What is seen of a body without a lattice of holes, and what measures it; or another error."""
+    """Error that tells how to measure a body without a lattice of holes; or ``error`` itself."""
     if "no lattice" not in str(error) and not mask.all():
         return error
     height, width = (mask.any(axis=k).sum() * grid.pixel_size for k in (1, 0))

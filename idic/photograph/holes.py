@@ -1,8 +1,8 @@
 """Holes in a mask of the material, and the lattice on which they lie.
 
-Neighbours repeat: the vectors from hole to hole gather around the lattice's own. The two that are
-met most often and are not parallel are reduced to the shortest. Going from each hole to its
-neighbours then counts every hole, (i, j), also where the lattice is bent or holes are missing.
+The vectors from hole to neighbouring hole cluster around the lattice's own. The two most frequent
+ones that are not parallel are reduced to the shortest. Stepping from each hole to its neighbours
+then gives every hole its index (i, j), also where the lattice is bent or holes are missing.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from modeharvest.util.errors import InputError
 _MUCH_SMALLER = 0.25
 """Openings below this share of the typical area are scratches, bubbles and noise."""
 _ALIKE = 0.25
-"""Vectors this near to each other, as a share of the pitch, stand for one of the lattice's, and
-holes for a place in it: locally, strain differs by 10 %, and holes are moulded a little off."""
+"""Distance, as a share of the pitch, within which vectors are the same lattice vector, and holes
+are at a lattice point: locally, strain differs by 10 %, and holes are moulded a little off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Holes:
     centres: FloatArray
     """(n, 2) centroids, (row, col) [px]."""
     diameters: FloatArray
-    """(n,) of circles with the holes' areas [px]."""
+    """(n,) diameters of circles with the holes' areas [px]."""
     too_small: int
     """Number of openings left out because the others are much larger."""
     at_border: int
@@ -134,7 +134,7 @@ def _oriented(basis: tuple[FloatArray, FloatArray]) -> FloatArray:
 Kind = Literal["square", "hexagonal", "rectangular", "oblique"]
 
 _BENT = 0.25
-"""Rms distance from a straight lattice, as a share of the pitch, that is no lattice any more."""
+"""Largest rms distance from a straight lattice, as a share of the pitch."""
 _MOST = 0.5
 """Share of the holes that must be on the lattice."""
 _EQUAL, _RIGHT_DEG = 0.06, 4.0
@@ -159,9 +159,9 @@ class HoleLattice:
     vectors: FloatArray
     """(2, 2) lattice vectors as rows, each (row, col) [px], of the best straight lattice."""
     origin: FloatArray
-    """(2,) (row, col) of (0, 0) [px]."""
+    """(2,) position (row, col) of the lattice point (0, 0) [px]."""
     diameters: FloatArray
-    """(n,) of circles with the holes' areas [px]."""
+    """(n,) diameters of circles with the holes' areas [px]."""
     missing: IntArray
     """(m, 2) indices of lattice points amid the others without a hole."""
     extra: FloatArray

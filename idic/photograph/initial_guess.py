@@ -1,15 +1,15 @@
-"""Initial guess: ansatz and unknowns from a pair of images, with no number typed.
+"""Initial guess: ansatz and unknowns from a pair of images, without manual input.
 
 What the paper does by eye in its Section "Parametrization and Initial Guess of the Patterning
-Modes": a displacement field, its spectral densities, the waves that they show, the family that
-these belong to. The field is a local DIC's where there is one, and otherwise a rough one that the
-images give by themselves.
+Modes" is automated here: from a displacement field to its spectral densities, the waves that they
+show, and the family of these waves. The field is that of a local DIC if there is one, otherwise a
+rough one that is measured from the images.
 
-1. v0: through the motion of hole centres, or of boundaries; not needed with a local DIC's field.
+1. v0: fitted to the motion of hole centres, or of boundaries; not needed with a local DIC's field.
 2. A field, rough or measured, and its spectrum over each region.
 3. Modes: the square family with seven parameters, or free waves, or the pattern that the lattice of
    holes allows, fixed, where the images show none.
-4. v0 and every v_i, together, by robust least squares through the field.
+4. v0 and every v_i, fitted together to the field by robust least squares.
 """
 
 from __future__ import annotations
@@ -45,22 +45,22 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 DIAGONAL = 0.1
-"""Difference of |kx| and |ky|, relative, up to which a wave lies along a diagonal."""
+"""Relative difference of |kx| and |ky| up to which a wave counts as lying along a diagonal."""
 SAME_WAVE = 0.15
-"""Distance [1/l] within which two wave vectors are one, up to a reciprocal lattice vector."""
+"""Distance [1/l] within which two wave vectors are the same, up to a reciprocal lattice vector."""
 AMPLITUDE_DEGREE = 2
-"""Total degree of every v_i at first: strongest in the middle, weaker at clamped edges."""
+"""Total degree of every v_i at first: largest in the middle, smaller at clamped edges."""
 
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """Where a correlation begins, and how that was found."""
+    """The initial guess of a correlation, and how it was found."""
 
     ansatz: Ansatz
     unknowns: FloatArray
-    """(size,) for :func:`modeharvest.idic.correlate.correlate`."""
+    """(size,) initial unknowns for :func:`modeharvest.idic.correlate.correlate`."""
     patterns: tuple[WavePattern, ...]
-    """What the spectra of the field show, part by part; the modes follow one another likewise."""
+    """Wave patterns in the spectra of the field, one for each part; modes are in the same order."""
     local: LocalField
     text: tuple[str, ...]
 
@@ -82,11 +82,11 @@ def initial_guess(
 
     cell_size : l, the distance of neighbouring holes [mm].
     cellular : The part with holes [mm]; or several parts, each with modes of its own.
-    local : A displacement field of a local DIC; the grey levels are not looked at then.
+    local : A displacement field of a local DIC; the grey levels are not used then.
     holes : Displacements of the holes' centres.
     lattice : (2, 2) vectors of the lattice of holes as rows [mm]; by default square, along x and y.
-    domain : Of the Chebyshev polynomials [mm]; by default the material's bounding box.
-    options : Degrees; the paper's by default.
+    domain : Box of the Chebyshev polynomials [mm]; by default the material's bounding box.
+    options : Polynomial degrees; the paper's by default.
     """
     options = options or AnsatzOptions()
     boxes = (cellular,) if isinstance(cellular, Box) else tuple(cellular)
@@ -135,7 +135,7 @@ def initial_guess(
 
 
 NEARLY_SQUARE = 0.05
-"""Relative difference of lengths, and cosine between directions, of a square lattice's vectors."""
+"""Relative difference of lengths, and cosine between directions, up to which vectors are square."""
 WRONG_CELL = 0.07
 """Relative difference of a cell size given from one found, beyond which they contradict each
 other: over the paper's six cells the phase of its mode drifts by 1.3 rad, and a correlation may
@@ -165,7 +165,7 @@ class Cells:
         boxes: Sequence[Box],
         holes: LocalField | None,
     ) -> Cells:
-        """Take what is given, and the rest from the mask; raises InputError if they differ."""
+        """Use what is given, and find the rest from the mask; InputError if they contradict."""
         if not cell_size > 0:
             raise InputError(f"initial guess: expected a positive cell size, got {cell_size} mm")
         vectors = _matching_vectors(cell_size, lattice)
@@ -184,7 +184,7 @@ class Cells:
 
     @property
     def square(self) -> bool:
-        """Whether the lattice vectors are as long as each other, and at right angles."""
+        """Whether the lattice vectors are equally long, and at right angles."""
         a, b = np.linalg.norm(self.vectors, axis=1)
         cosine = abs(self.vectors[0] @ self.vectors[1]) / (a * b)
         return bool(abs(a - b) <= NEARLY_SQUARE * a and cosine <= NEARLY_SQUARE)
@@ -207,7 +207,7 @@ def _require_hole_distance(apart: float, cell_size: float, found: str) -> None:
 
 
 def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(2,) where the hole in the middle should be, by itself and its neighbours [mm]."""
+    """(2,) position of the middle hole, as the mean of itself and its neighbours' [mm]."""
     middle = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
     steps = np.linalg.solve(vectors.T, (centres - middle).T).T
     near = np.abs(steps).max(axis=1) < 1.5
@@ -217,7 +217,7 @@ def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
 def _matching_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
     """(2, 2) vectors of the lattice of holes as rows [mm], the first one nearest to the x axis.
 
-    Raises InputError if it isn't one, or its shortest distance isn't the cell size within 7 %.
+    Raises InputError if ``lattice`` isn't one, or its shortest distance isn't l within 7 %.
     """
     if lattice is None:
         return cell_size * np.eye(2)
@@ -252,10 +252,10 @@ def require_cell_size(pattern: WavePattern, cell_size: float) -> None:
 
 
 def modes_of(pattern: WavePattern, cells: Cells) -> list[ModeFamily]:
-    """Modes for the waves of a pattern: the paper's family if it is the square one, else free ones.
+    """Make the modes of a pattern: the paper's family for the square pattern, else free waves.
 
-    Waves whose vectors differ by one of the reciprocal lattice are coupled by the holes, and make
-    one mode; any others share nothing, and each group has a mode, and an amplitude v, of its own.
+    Waves whose vectors differ by a reciprocal lattice vector are coupled by the holes and make one
+    mode. Each group of such waves has its own mode, with its own amplitude v.
     """
     if pattern.start is not None:
         return [replace(nearest_origin(pattern.start, cells.cell_size), name="square")]
@@ -263,7 +263,7 @@ def modes_of(pattern: WavePattern, cells: Cells) -> list[ModeFamily]:
 
 
 def _coupled(cells: Cells, one: PlaneWave, other: PlaneWave) -> bool:
-    """Whether two wave vectors, or one and the other's opposite, differ by a reciprocal vector."""
+    """Whether two waves, or one and the other's opposite, differ by a reciprocal lattice vector."""
     apart = np.array(other.xi) - np.outer((1.0, -1.0), one.xi)
     periods = cells.vectors @ apart.T / cells.cell_size
     rest = np.linalg.solve(cells.vectors, periods - np.round(periods)) * cells.cell_size
@@ -277,7 +277,7 @@ def _free_mode(waves: list[PlaneWave]) -> ModeFamily:
 
 
 def _fitted(ansatz: Ansatz, local: LocalField) -> RobustFit:
-    """v0 and every v_i through the field; a mode that isn't observable isn't fitted."""
+    """Fit v0 and every v_i to the field; a mode that isn't observable isn't fitted."""
     a, slow = ansatz.initial_guess(), min(SLOW_DEGREE, ansatz.v0_degree)
     if not ansatz.fixed:
         return fit_unknowns(ansatz, a, local, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
@@ -289,7 +289,7 @@ def _fitted(ansatz: Ansatz, local: LocalField) -> RobustFit:
 def chosen_modes(
     guess: InitialGuess, geometry: Geometry, cell_size: float, how: PhotographOptions
 ) -> tuple[Ansatz, FloatArray]:
-    """The guess's ansatz and unknowns with the specified family, its modes fixed or not."""
+    """Adapt the guess's ansatz and unknowns to the specified family, and fix the modes or not."""
     ansatz, unknowns = guess.ansatz, guess.unknowns
     lattice = geometry.lattice
     wants_square = how.family == "square" and lattice is not None and "square" not in guess.family
@@ -314,7 +314,7 @@ def chosen_modes(
 
 
 def with_fixed_modes(ansatz: Ansatz, unknowns: FloatArray) -> tuple[Ansatz, FloatArray]:
-    """The same ansatz with its modes fixed where the unknowns have them, and fewer unknowns."""
+    """Fix an ansatz' modes at the parameters in its unknowns; returns it with fewer unknowns."""
     modes = []
     for i, mode in enumerate(ansatz.modes):
         here = replace(mode.family, start=unknowns[ansatz.phi_slice(i)])
@@ -338,7 +338,7 @@ def shows_more(
 
 
 def _waves(ansatz: Ansatz, unknowns: FloatArray) -> list[tuple[Taper, FloatArray]]:
-    """Every wave's part of the specimen, and its vector in half turns a cell."""
+    """Every wave's part of the specimen, and its wave vector [half turns per cell]."""
     return [
         (mode.taper, wave[2:4])
         for i, mode in enumerate(ansatz.modes)

@@ -3,9 +3,9 @@
 Holes are identified by their place in the lattice, not by their distance, so displacements may be
 larger than half the pitch.
 
-Blocks of the reference are looked for where they should have moved to, and as a comparison
-where they surely are not. If they correlate no better in the first place, the reference is not
-the reference, or the motion is larger than expected.
+Blocks of the reference are searched where they should have moved to and, for comparison, where they
+surely are not. If they correlate no better at the former places, the reference is the wrong image,
+or the motion is larger than expected.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from modeharvest.util.masks import room_around
 _ALIKE = 0.4
 """Relative change of the lattice vectors beyond which two lattices are not the same specimen's."""
 _RIVAL = 0.8
-"""Share of the most matched holes with which another way to lay one lattice on the other counts."""
+"""Share of the most matched holes from which on another alignment of two lattices counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class HoleMotion:
     after: FloatArray
     """(n, 2) centres in the reference and in the deformed image, (row, col) [px]."""
     rivals: int
-    """Number of other ways to lay the lattices on each other that match as many holes."""
+    """Number of other alignments of the lattices that match as many holes."""
     text: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -57,7 +57,7 @@ class HoleMotion:
         return field_between(self.before, self.after, grid, "centres of holes")
 
     def at(self, points: ArrayLike) -> FloatArray:
-        """(n, 2) (row, col) that positions (n, 2) of the reference have moved to [px].
+        """Positions (n, 2) to which positions (n, 2) of the reference moved, (row, col) [px].
 
         Between the holes the displacement is interpolated by linear radial functions and a plane.
         """
@@ -67,12 +67,12 @@ class HoleMotion:
 
 
 def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[HoleMotion, ...]:
-    """All ways to lay the deformed lattice on the reference's, the likeliest first.
+    """All alignments of the deformed lattice with the reference's, the likeliest first.
 
-    Lattices look alike when moved by a whole cell; what decides is how many holes find a partner,
-    then the shorter mean displacement. If the outer rows of a specimen leave the image, several
-    ways match as many, and only the speckle can decide. Raises InputError if the lattices can't be
-    the same specimen's.
+    A lattice looks the same when shifted by a whole cell. Therefore the number of holes with a
+    partner decides, then the shorter mean displacement. If the outer rows of a specimen leave the
+    image, several alignments match as many holes, and only the speckle can decide. Raises
+    InputError if the lattices can't be the same specimen's.
     """
     index = _in_basis_of(reference, deformed)
     steps = Counter(
@@ -89,7 +89,7 @@ def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[Hol
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """A turn and a shift of the whole specimen: x goes to turn (x - before) + after."""
+    """Rotation and translation of the whole specimen: x goes to turn (x - before) + after."""
 
     angle_deg: float
     """Counter-clockwise as the photograph is seen [degrees]."""
@@ -98,10 +98,10 @@ class RigidMotion:
     """A point of the specimen in the reference and in the deformed image, (row, col) [px]."""
 
     def undone(self, image: FloatImage, mask: BoolArray) -> tuple[FloatImage, BoolArray]:
-        """A deformed image (rows, cols) as if it hadn't happened, and the mask of its material.
+        """Remove the motion from a deformed image (rows, cols) and the mask of its material.
 
-        By a quintic spline. What comes from beyond the image is no material, and as grey as what
-        else is none.
+        Interpolated by a quintic spline. Pixels from outside the image are not material; their grey
+        level is the median of what isn't material.
         """
         grid = np.indices(image.shape, np.float64) - np.reshape(self.before, (2, 1, 1))
         c, s = math.cos(math.radians(self.angle_deg)), math.sin(math.radians(self.angle_deg))
@@ -115,10 +115,10 @@ class RigidMotion:
 
 
 def rigid_motion(reference: HoleLattice, deformed: HoleLattice) -> RigidMotion:
-    """How the holes have turned and moved as a whole; strain and pattern are no part of it.
+    """Rotation and translation of the holes as a whole, without strain and pattern.
 
-    By the least squares of G. Wahba's problem, the holes matched as is likeliest: by less than some
-    25 degrees, and up to whole cells. Raises InputError if these are not the same specimen's.
+    The least-squares solution of G. Wahba's problem, for the likeliest match of the holes: below
+    some 25 degrees, and up to whole cells. InputError if they aren't the same specimen's.
     """
     motion = possible_motions(reference, deformed)[0]
     before, after = motion.before.mean(axis=0), motion.after.mean(axis=0)
@@ -130,7 +130,7 @@ def rigid_motion(reference: HoleLattice, deformed: HoleLattice) -> RigidMotion:
 
 
 def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:
-    """Indices of the deformed holes with respect to the vectors that were the reference's.
+    """Indices of the deformed holes in the basis that corresponds to the reference's vectors.
 
     A lattice has many bases, and compression can change which one is the shortest.
     """
@@ -156,7 +156,7 @@ def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:
 def _motion(
     reference: HoleLattice, deformed: HoleLattice, index: IntArray, rivals: int
 ) -> HoleMotion:
-    """The holes matched where the deformed ones have these indices in the reference's lattice."""
+    """Match holes; ``index``: indices of the deformed ones in the reference's lattice."""
     first, second = np.nonzero((reference.index[:, None] == index).all(axis=-1))
     before, after = reference.centres[first], deformed.centres[second]
     moved = np.linalg.norm(after - before, axis=1)
@@ -178,7 +178,7 @@ Expected = Callable[[FloatArray], FloatArray]
 
 
 def expected_by(displacement: Slow, grid: PixelGrid) -> Expected:
-    """Where a displacement [mm] takes positions of the reference."""
+    """Map positions of the reference to those that a displacement [mm] takes them to."""
 
     def moved(points: FloatArray) -> FloatArray:
         before = np.column_stack(grid.to_mm(*points.T))
@@ -188,17 +188,17 @@ def expected_by(displacement: Slow, grid: PixelGrid) -> Expected:
 
 
 BLOCKS, BLOCK_PX, SMALLEST_PX = 120, 41, 15
-"""About so many blocks of such an edge, smaller where ligaments are too narrow for it."""
+"""Approximate number of blocks, and their edge, smaller where ligaments are too narrow for it."""
 REACH_PX = 24
-"""A block may be so far from where it is expected, along rows and along columns."""
+"""Largest distance of a block from where it is expected, along rows and along columns."""
 TURNS_DEG = (0.0, -12.0, 12.0, -24.0, 24.0)
-"""Blocks are turned so [degrees]: where holes buckle, what lies between them turns that much."""
+"""Rotations of blocks that are tried [degrees]: junctions between buckling holes turn that much."""
 _SAME = 0.5
 """Share of blocks that must be found."""
 _CLEAR = 0.1
-"""By how much a correlation must exceed what chance gives."""
+"""Least excess of a correlation over that by chance, as a share of 1 minus the latter."""
 _LEAST_AREA = 0.1
-"""Of a block over that in the reference; if it is expected smaller, what is expected is wrong."""
+"""Least expected area of a block, over that in the reference; below, the expectation is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,7 @@ class BlockMatch:
     correlation: FloatArray
     """(n,) normalised cross-correlation there [-]."""
     chance: float
-    """Correlation that 95 % of the blocks stay below where they can't be [-]."""
+    """Correlation that 95 % of the blocks don't reach at places where they can't be [-]."""
     block_px: int
     """Edge of a block [px]."""
 
@@ -231,7 +231,7 @@ class BlockMatch:
         return self.share >= _SAME
 
     def in_mm(self, grid: PixelGrid) -> LocalField:
-        """The blocks found, to about a pixel; enough for an initial guess."""
+        """Displacements of the blocks found, to about a pixel; enough for an initial guess."""
         return field_between(self.before[self.found], self.after[self.found], grid, "blocks")
 
     @property
@@ -253,7 +253,7 @@ def match_blocks(
 
     expected : Where positions should have moved to, as ``HoleMotion.at`` gives it.
     reach_px : How far from there a block is searched for, along rows and columns [px].
-    count : About how many blocks an image would hold.
+    count : Approximate number of blocks that a whole image would hold.
     """
     f, g = pair.reference, pair.deformed
     centres, half = _blocks(pair.masks[0], count)
@@ -267,7 +267,7 @@ def match_blocks(
         )
     blocks = _turned(f, centres, half, _gradient(expected, centres, half))
     there = [_search(g, block, aim, reach_px) for block, aim in zip(blocks, aims, strict=True)]
-    # What chance gives is known well enough from some of many.
+    # Some of many blocks suffice for the correlation by chance.
     some = range(0, len(aims), max(1, len(aims) // BLOCKS))
     elsewhere = np.roll(aims, len(aims) // 2, axis=0)
     decoys = [_search(g, blocks[i], elsewhere[i], reach_px) for i in some]
@@ -293,7 +293,7 @@ def require_same_surface(
 
 
 def matched_holes(pair: ImagePair, lattice: HoleLattice | None) -> tuple[HoleMotion | None, str]:
-    """How the reference's holes have moved, and a text about it; None where it isn't known.
+    """Find the motion of the reference's holes, None where unknown, and a text about it.
 
     Where a column of holes has left the image, the holes alone allow several answers; the speckle
     between them decides. Raises InputError if the images don't show the same surface.
@@ -347,7 +347,7 @@ def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
 def _search(
     g: FloatImage, block: FloatImage, aim: NDArray[np.int64], reach: int
 ) -> tuple[NDArray[np.int64], float]:
-    """Where around ``aim`` a block (turns, edge, edge) fits best, turned or not; how well."""
+    """Position near ``aim`` where a block (turns, edge, edge) fits best; its correlation."""
     half = block.shape[-1] // 2
     low = np.maximum(aim - half - reach, 0)
     high = np.minimum(aim + half + reach + 1, g.shape)
@@ -359,7 +359,7 @@ def _search(
 
 
 def _gradient(expected: Expected, centres: NDArray[np.int64], half: int) -> FloatArray:
-    """(n, 2, 2) how the surroundings of centres (n, 2) are stretched where they are expected."""
+    """(n, 2, 2) expected deformation gradient around centres (n, 2)."""
     sides = [(expected(centres + d) - expected(centres - d)) / 2.0 for d in np.eye(2) * 2 * half]
     F = np.stack(sides, axis=-1) / (2 * half)
     return np.where(np.linalg.det(F)[:, None, None] < _LEAST_AREA, np.eye(2), F)
@@ -377,10 +377,10 @@ def _turned(
 
 
 def _correlation(window: FloatImage, blocks: FloatImage) -> FloatArray:
-    """Normalised cross-correlation of blocks (n, k, k) everywhere in a window (rows, cols).
+    """Normalised cross-correlation of blocks (n, k, k) at all places in a window (rows, cols).
 
-    As ``skimage.feature.match_template``, which would transform the window anew for each block: (n,
-    rows - k + 1, cols - k + 1), 0 where a block or what it lies on is of one grey.
+    Like ``skimage.feature.match_template``, which would transform the window again for each block:
+    (n, rows - k + 1, cols - k + 1), 0 where a block or the window below it has one grey level.
     """
     k = blocks.shape[-1]
     shape = tuple(next_fast_len(size, real=True) for size in window.shape)

@@ -1,8 +1,8 @@
 """Material in a photograph: the speckled surface against holes and background.
 
-Within some pixels the speckled material's grey level varies, the background's hardly does, whether
-it is black, grey or white. That finds the background roughly; its own grey level, learnt there,
-then gives its extent pixel by pixel. What is out of focus at the edges is the wall of a hole.
+The grey level of a speckled material varies within some pixels; that of the background hardly does,
+whether it is black, grey or white. That finds the background roughly; its grey level there then
+gives its extent pixel by pixel. What is out of focus at the edges is the wall of a hole.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.masks import connected_to, grown, large_parts, opened, shrunk
 
 _WINDOW_SHARE, _WIDEST_PX = 0.15, 25
-"""Buckled holes are narrow: a share of a cell fits into them, and the widest window is enough."""
+"""Window over cell size, small because buckled holes are narrow, and the largest window [px]."""
 _REACH = 0.4
-"""Radius that a hole is at least as round as [windows]. Where the background is as dark or as
-bright as some speckles, nothing but this keeps such speckles at its edge apart from it."""
+"""Least radius of curvature of a hole [windows]. Where the background is as dark or as bright as
+some speckles, only this separates such speckles at its edge from it."""
 _SMOOTH_PX = 1.0
 """Blur that takes away most of a camera's noise and little of a speckle of 3 px."""
 _APART = 3.0
-"""Ratio of the typical contrast on material and on background from which on they are two things."""
+"""Least ratio of the typical contrasts on material and on background that separates them."""
 _SIGMAS = 4.0
 """A pixel within 4 standard deviations of the background's level may be background."""
 _FAINTEST = 0.002
@@ -35,13 +35,13 @@ _FAINTEST = 0.002
 _LENS_PX = 3.0
 """Beyond this a lens doesn't mix material with background."""
 _WIDE = 2.0
-"""Patches of the background's grey level that hold more than two disks of the reach are holes,
+"""Patches of the background's grey level that are larger than two disks of that radius are holes,
 however little of them was wide enough to lack contrast."""
 _SPECK_PX2 = 6
 """Area of what can be a few pixels' noise in the background."""
 _WALL_WINDOW, _WALL_SHARPNESS = 0.6, 0.3
-"""Out of focus is what has, in a window of this share of the speckle's, less than this share of
-the material's fine contrast."""
+"""Window of sharpness over that of speckle; and share of the material's fine contrast below which a
+region is out of focus."""
 _SLIGHTEST = 0.02
 """Share of material with grey levels of the background from which on that is reported."""
 
@@ -56,14 +56,14 @@ class MaterialMask:
 
 
 def window_for(cell_px: float) -> int:
-    """The window of :func:`find_material` where cells are that large [px]."""
+    """The window of :func:`find_material` for cells of this size [px]."""
     return int(np.clip(_WINDOW_SHARE * cell_px, 9, _WIDEST_PX)) // 2 * 2 + 1
 
 
 def find_material(image: ArrayLike, window: int = _WIDEST_PX) -> MaterialMask:
     """Find the material in an image (rows, cols) of a speckled specimen, grey levels in any unit.
 
-    ``window`` is the size of the square in which the speckle's contrast is looked at [px]: two to
+    ``window`` is the size of the square in which the speckle's contrast is evaluated [px]: two to
     three speckles across, and well below a hole's diameter. Raises InputError unless the image is
     plane, finite, larger than the window, and shows a speckle.
     """
@@ -143,7 +143,7 @@ def _refined(grey: FloatImage, sure: BoolArray, window: int) -> tuple[BoolArray,
 
 
 def _background(alike: BoolArray, sure: BoolArray, reach: float) -> BoolArray:
-    """What has the background's grey level far and wide, or is connected to what surely is it."""
+    """Wide regions of the background's grey level, or connected to what is surely background."""
     wide = opened(~large_parts(~alike, _SPECK_PX2 + 1), reach)
     return connected_to(sure, wide) | large_parts(wide, int(_WIDE * np.pi * reach**2) + 1)
 
@@ -172,7 +172,7 @@ def _without_walls(grey: FloatImage, material: BoolArray, window: int) -> tuple[
 def _background_level(
     grey: FloatImage, sure: BoolArray, reach: int
 ) -> tuple[FloatImage, FloatImage]:
-    """(level, standard deviation) of the background nearby, carried on into the material."""
+    """(level, standard deviation) of the background nearby, extrapolated into the material."""
     core = shrunk(sure, 2.0)
     core = core if core.any() else sure
     mean = float(grey[core].mean())

@@ -1,9 +1,9 @@
 """Measurement of one photograph: its noise, initial guess, correlation, residual test.
 
-With it a sequence can be correlated image by image: g_k against g_(k-1) at x + u_(k-1), which
-takes the reference's place. The unknowns stay those of the whole displacement, so there is
-nothing to add up, and the ansatz and its taper stay where they are; what one image loses,
-however, the next ones inherit.
+With it a sequence can be correlated image by image: g_k against g_(k-1) at x + u_(k-1), which takes
+the reference's place. The unknowns remain those of the total displacement, so that there is nothing
+to add up, and the ansatz and its taper stay in place. However, what is lost in one image is lost in
+the next ones, too.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.progress import Progress, silent
 
 POINTS_A_CELL = 24
-"""Along a cell, of the whole displacement's values that spectra are taken of."""
+"""Points per cell at which the whole displacement is sampled for spectra."""
 _REFITTED = (
     "From the best start there is the correlation ended in a local minimum: the result is the "
     "ansatz refitted to the whole displacement, with the standard deviations by noise that a "
@@ -67,8 +67,8 @@ _LOWER = "There are few cells: v0 is of degree {} and v1 of degree {}."
 def image_noise(pair: ImagePair, camera: CameraNoise) -> ImageNoise:
     """Noise of the reference and of a deformed photograph [grey levels].
 
-    Unless it was given for both, the deformed one's is larger or smaller by as much as its finest
-    details are: a lamp that has aged, or other exposure, shows there.
+    Unless it was given for both, the deformed image's noise is scaled by the ratio of the noise
+    estimates of both images, which shows an aged lamp or another exposure.
     """
     sd = camera.sd
     if camera.source == GIVEN:
@@ -106,7 +106,7 @@ def residual_test(result: Result, pair: ImagePair, noise: ImageNoise, edge_px: i
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPhotograph:
-    """What came out of one photograph."""
+    """The results of one photograph."""
 
     result: Result
     local: LocalField
@@ -130,9 +130,9 @@ def measure(
     cell_size : l [mm].
     how : The ansatz and how to correlate.
     local : A local DIC's field.
-    before : What came out of the photograph before. If it shows all waves that are observed now,
-        its ansatz is kept and its unknowns are the initial guess; if that doesn't converge, one is
-        found anew.
+    before : Results of the previous photograph. If they contain all waves that are observed now,
+        their ansatz is kept and their unknowns are the initial guess; if that doesn't converge, a
+        new one is found.
     """
     motion, matching = matched_holes(pair, geometry.lattice)
     holes = None if motion is None else motion.in_mm(geometry.grid)
@@ -163,10 +163,10 @@ def measure_whole(
 ) -> MeasuredPhotograph:  # fmt: skip
     """Measure the whole displacement of a photograph that was correlated, and the modes in it.
 
-    The measurement starts from the correlation, or from blocks of the speckle where that ended
-    astray. If its spectra show other waves than the correlation has, or a family with fewer
-    parameters for them, or that isn't converged, the ansatz fitted to it starts another; if that
-    ends astray, too, the fit itself is the result. For the rest see :func:`measure`.
+    The measurement starts from the correlation, or from blocks of the speckle if that failed. The
+    ansatz fitted to the measurement starts another correlation if the spectra show other waves than
+    the first one has, or a family with fewer parameters for them, or if that one isn't converged;
+    if the second fails, too, the fit itself is the result. For the rest see :func:`measure`.
     """
     mesh, found, mask = body.mesh, first.result, geometry.mask
     if found.outcome not in ASTRAY:
@@ -211,7 +211,7 @@ def found_modes(
     pair: ImagePair, geometry: Geometry, cell_size: float, how: PhotographOptions,
     local: LocalField | None, holes: LocalField | None = None,
 ) -> tuple[InitialGuess, Ansatz, FloatArray, tuple[str, ...]]:  # fmt: skip
-    """An initial guess, the ansatz and the unknowns that are chosen from it, and how, in words."""
+    """Find an initial guess, the ansatz and unknowns chosen from it, and a text about them."""
     region = geometry.region
     lower = for_cells(how, region.domain, region.cellular, cell_size)
     guess = initial_guess(
@@ -233,7 +233,7 @@ def with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, Flo
 
 
 def _goes_on(before: Result, ansatz: Ansatz, unknowns: FloatArray) -> bool:
-    """Whether the result before is an initial guess: converged, with all waves observed now."""
+    """Whether the previous result can start this one: converged, with all waves observed now."""
     if before.outcome is not Outcome.CONVERGED or before.ansatz.fixed != ansatz.fixed:
         return False
     return not shows_more(ansatz, unknowns, before.ansatz, before.unknowns)
@@ -253,7 +253,7 @@ def _guess_text(guess: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tupl
 
 
 def _moved_holes(result: Result, geometry: Geometry) -> LocalField | None:
-    """v0 at the reference's holes, as if they had been followed; None without any."""
+    """v0 at the reference's holes, in place of their observed motion; None without holes."""
     if geometry.lattice is None:
         return None
     x, y = geometry.grid.to_mm(*geometry.lattice.centres.T)
@@ -266,9 +266,9 @@ def warped_back(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Show a deformed image g (rows, cols) in the frame of the reference.
 
-    (1 + b) g(x + u) + c [grey levels] with a result's displacement, or one that is given, (rows,
-    cols, 2) [mm], and gain and offset if they were unknowns; and where x + u is known and lies
-    inside the image. The spline's order is 3 or 5.
+    Returns (1 + b) g(x + u) + c [grey levels], and where x + u is known and inside the image. u is
+    a result's displacement, or the one given, (rows, cols, 2) [mm]; gain and offset are used if
+    they were unknowns. The spline's order is 3 or 5.
     """
     spline = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
     image = np.vstack([np.float32(band) for band in result.warped_back(spline, u)])

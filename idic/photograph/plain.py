@@ -1,8 +1,8 @@
 """Photographs of a plain specimen, without speckle: its material, its contours, holes and dots.
 
-Such a picture has two grey levels, and its information is where they meet. Contours are taken at
-half-way between the levels around, which may vary slowly over the picture, after a blur of less
-than a pixel. What blur moves curved edges by, its variance over twice their radius, is put back.
+Such a picture has two grey levels; its information is where they meet. After a blur below a pixel,
+contours are taken half-way between the levels nearby, which may vary slowly over the picture. Blur
+shifts curved edges by its variance over twice their radius; that is corrected.
 """
 
 from __future__ import annotations
@@ -41,42 +41,42 @@ from modeharvest.util.typed import picked
 
 _BLUR_PX = 0.7
 _CORRELATED_PX = 2.0 * np.sqrt(np.pi) * _BLUR_PX
-"""Length over which that correlates white noise."""
+"""Length over which that blur correlates white noise."""
 _LENS_PX = 1.0
-"""Width of a lens that a picture of two grey levels exactly didn't have."""
+"""Blur of a lens, which is added to a picture of exactly two grey levels."""
 _TWO_LEVELS = 0.9
 """Share of a picture's variance that two grey levels explain: 0.98 of plain pictures with noise of
 1 %, 0.67 to 0.81 of speckled ones with a background."""
 _LIGHT_SHARE = 0.1
-"""Over which part of the picture's shorter side grey levels are averaged."""
+"""Share of the picture's shorter side over which grey levels are averaged."""
 _ROUNDS, _SAMPLES_A_WIDTH = 3, 10
 _COARSE_PX = 400
-"""Shorter side of what is looked at first: most pictures have speckle, which shows there, too."""
+"""Shorter side of the coarse picture tested first: most pictures have speckle, also seen there."""
 _INSIDE_PX = 4.0
 """Pixels farther than this from any edge show the grey levels."""
 _SPECKLE_PX, _LAG_PX = 8.0, 2
 _FAINTEST, _ALIKE_GREY = 0.02, 0.3
-"""Speckle is what varies by more than a fiftieth of the step at edges, and is alike 2 px away."""
+"""Speckle varies by more than a fiftieth of the step at edges, and is correlated over 2 px."""
 _DIFFERENCE_PX2 = 1.0 / 3.0
 """Variance of the blur that differences over two pixels add."""
 _EVERY_PX, _CURVED_PX, _SHARPENED = 0.5, 5.0, 2
-"""Distance of a contour's points; polynomials through so many px on both sides have its curvature,
-as it is after so many steps."""
+"""Spacing of a contour's points; half-length of the polynomial fits that give its curvature; number
+of iterations after which that is the curvature before the blur."""
 _SHARPEST = 1.0 / 3.0
-"""Largest curvature [1/px]: that of a corner is no radius."""
+"""Largest curvature [1/px] that is corrected for: a corner has no radius."""
 _LEAST_PX2 = 60.0
 """Area of a hole or island; smaller ones are dirt."""
 _DOT, _DOT_GROWS = 1.0 / 6.0, 1.8
-"""Area over that of the largest hole of what is a dot on the material, at most, and over that of
-the reference's largest dot in another picture, where holes may be nearly closed."""
+"""Largest area of a dot on the material, over that of the largest hole; and in another picture,
+where holes may be nearly closed, over that of the reference's largest dot."""
 _CLEAR = 0.02
-"""Share of the picture's border that dirt may be taken for."""
+"""Share of the picture's border that may be dirt."""
 _ONE_OF_MANY = 0.2
-"""Area of the largest hole over all holes', at most, where the border is all material."""
+"""Largest area of a hole over that of all holes, where the picture's border is all material."""
 _SHORTEST_CUT = 24
-"""Points of a contour that ends at the picture's border, at least: corners of others are no use."""
+"""Least number of points of a contour that ends at the picture's border: corners are no use."""
 _SECOND = 0.2
-"""Area over the largest one's from which on another island is a specimen."""
+"""Least area of another island, over the largest one's, that counts as a specimen."""
 _TURNS_DEG = np.arange(-24.0, 25.0, 6.0)
 """Rotations of the specimen between two pictures that are tried."""
 _CONTOURS = (
@@ -93,10 +93,10 @@ _DOTS = (
 )
 _LEFT = "Some of the specimen has left the picture: what is there follows from a law alone."
 _GROWING = np.array([4.0, 6.0, 9.0, 14.0, 20.0, 30.0, np.inf, np.inf])
-"""How far from the middle of a picture holes are matched in turn, over the reach of a match: the
-next is where those before say that it is."""
+"""Distances from the picture's middle within which holes are matched in turn, over the reach of a
+match: holes matched before predict where the next ones are."""
 _ALIKE = 0.4
-"""Share of the distance to the next hole within which a hole is looked for."""
+"""Radius within which a hole is searched, over the distance to the next hole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +111,9 @@ class MaterialContours:
     noise: float
     """Variance of a contour's distance times the length over which it is correlated [px^3]."""
     warnings: tuple[str, ...] = ()
-    """Whether there are other specimens in the picture, and whether all of this one is."""
+    """Remarks: other specimens in the picture, parts of this one out of view, dots."""
     cut: tuple[FloatArray, ...] = ()
-    """Those that the picture's border cuts; none if all of the specimen is in view."""
+    """Contours cut by the picture's border; none if all of the specimen is in view."""
     dots: tuple[FloatArray, ...] = ()
     """(n, 2) points (row, col) [px] around marks on the material, which belong to it."""
 
@@ -124,7 +124,7 @@ class MaterialContours:
         return bool(self.cut) or bool(around)
 
     def on(self, grid: PixelGrid) -> tuple[list[Contour], ...]:
-        """Outer contours, those of holes, of cuts, and of dots, in a grid's frame [mm]."""
+        """Contours in a grid's frame [mm]: outer ones, those of holes, cut ones, those of dots."""
         kinds = (self.contours, True), (self.cut, False), (self.dots, True)
         closed, cut, dots = (
             [Contour(np.column_stack(grid.to_mm(*points.T)), whole) for points in part]
@@ -137,7 +137,7 @@ class MaterialContours:
 def plain_surface(
     image: FloatImage, like: BoolArray | None = None, dot_px2: float | None = None
 ) -> MaterialContours | None:
-    """What a picture (rows, cols) shows if it shows a plain material; None if it has speckle.
+    """Find the contours of a plain material in a picture (rows, cols); None if it has speckle.
 
     Of several specimens the largest is taken, or the one where ``like`` is True. One that reaches
     the picture's border is in view in part: its contours end there. Contours within the material of
@@ -168,13 +168,13 @@ def plain_surface(
     slope = _slope(grey, contours + cut)
     # White noise of the pixels, blurred: its variance at a point times its correlation length.
     noise = estimated_noise(image, material).sd ** 2 / _CORRELATED_PX
-    # The slope of a straight edge says how far the lens, the pixels and this have blurred it.
+    # The slope of a straight edge shows the blur by lens, pixels and the filter above.
     blur = float(np.abs(step[material]).mean()) / (slope * np.sqrt(2.0 * np.pi))
     variance = max(0.0, blur**2 - _DIFFERENCE_PX2)
     sharp = tuple(_unbent(Contour(points), variance) for points in contours)
     ends = tuple(_unbent(Contour(points, False), variance) for points in cut)
     marks = tuple(_unbent(Contour(points), variance) for points in dots)
-    # Noise and grey level are those beside dots, which are material all the same.
+    # Noise and grey level were taken without the dots, which are material all the same.
     mask = _filled(material, most) if dots else material
     return MaterialContours(mask, sharp, noise / slope**2, text, ends, marks)
 
@@ -182,7 +182,7 @@ def plain_surface(
 def _without_dots(
     contours: tuple[FloatArray, ...], outer: int, most: float | None
 ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], float]:
-    """Closed contours, the largest first, less those of dots; these, and what parts them [px^2]."""
+    """Closed contours, the largest first, without dots; the dots; an area between both [px^2]."""
     areas = np.abs([signed_area(points) for points in contours])
     if most is None:
         most = _DOT * float(areas[outer:].max(initial=0.0))
@@ -193,7 +193,7 @@ def _without_dots(
 
 
 def _filled(material: BoolArray, area: float) -> BoolArray:
-    """The material with what it surrounds of less than an area [px^2]."""
+    """The material, with the holes in it smaller than ``area`` [px^2] filled."""
     inside = binary_fill_holes(material) & ~material
     return np.asarray(material | (inside & ~large_parts(inside, area)))
 
@@ -201,7 +201,7 @@ def _filled(material: BoolArray, area: float) -> BoolArray:
 def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | None:
     """(rows, cols) where a picture is bright, the middle of its two levels, and their difference.
 
-    None unless these explain most of it.
+    None unless the two levels explain most of the picture's variance.
     """
     bright = grey > float(threshold_otsu(grey))  # type: ignore[no-untyped-call]
     for _ in range(_ROUNDS):
@@ -216,10 +216,10 @@ def _two_levels(grey: FloatImage) -> tuple[BoolArray, FloatArray, FloatArray] | 
 
 
 def _is_material(bright: BoolArray) -> bool:
-    """Whether the material is bright: what isn't at the picture's border.
+    """Whether the material is the bright level: the material isn't at the picture's border.
 
-    Where both are there, it is what is in fewer parts, because holes are many; what is around many
-    that are alike is material, too.
+    Where both levels are at the border, the material is the one in fewer parts, because holes are
+    many. A level at the border that surrounds many similar parts is the material, too.
     """
     border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]]).mean()
     sizes = [np.bincount(label(large_parts(s, _LEAST_PX2))[0][s])[1:] for s in (bright, ~bright)]
@@ -232,7 +232,7 @@ def _is_material(bright: BoolArray) -> bool:
 def contours_around(
     signed: FloatArray, material: BoolArray
 ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
-    """Contours (n, 2) at 0 around a material: closed ones, the longest first, and those cut."""
+    """Contours (n, 2) at 0 around a material: closed ones, the largest first, and cut ones."""
     closed, cut = [], []
     for points in find_contours(signed.astype(np.float64), 0.0):
         row, col = np.rint(points[len(points) // 2]).astype(int)
@@ -250,7 +250,7 @@ def contours_around(
 def one_specimen(
     material: BoolArray, like: BoolArray | None, of_another: str, apart_px: float = 0.0
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """The largest island, or the one where ``like`` is True; whether there are other specimens.
+    """Select the largest island, or the one where ``like`` is True; a text if there are others.
 
     ``of_another``: what to do to measure another one; islands less than twice ``apart_px`` apart
     are one.
@@ -272,7 +272,7 @@ def _inside(material: BoolArray) -> BoolArray:
 
 
 def _level(grey: FloatImage, region: BoolArray) -> FloatArray:
-    """(rows, cols) grey level of a region, away from its edges, as it is around each pixel."""
+    """(rows, cols) grey level of a region, away from its edges, averaged around each pixel."""
     inside = _inside(region)
     mean, width = float(grey[inside].mean()), _LIGHT_SHARE * min(grey.shape)
     every = max(1, int(width / _SAMPLES_A_WIDTH))  # what varies slowly is known by few pixels
@@ -285,7 +285,7 @@ def _level(grey: FloatImage, region: BoolArray) -> FloatArray:
 
 
 def _shows_speckle(image: FloatImage, material: BoolArray, step: FloatArray) -> bool:
-    """Whether the material's grey level varies by more than noise, which pixels don't share."""
+    """Whether the material's grey level varies by more than noise, which is uncorrelated."""
     inside = _inside(material)
     weight = gaussian_filter(inside.astype(np.float32), _SPECKLE_PX) + np.float32(1e-6)
     grey = np.where(inside, image, 0.0).astype(np.float32)
@@ -298,9 +298,9 @@ def _shows_speckle(image: FloatImage, material: BoolArray, step: FloatArray) -> 
 
 
 def _unbent(contour: Contour, variance: float) -> FloatArray:
-    """(n, 2) points of a contour less what a blur of a variance [px^2] moved it, 1/2R times that.
+    """(n, 2) points of a contour, corrected for its shift by a blur of ``variance`` [px^2].
 
-    To the centre of curvature, that is, of the contour before the blur: found by iteration.
+    The shift is variance/2R, towards the centre of curvature before the blur, found by iteration.
     """
     seen, step = contour.evenly(_EVERY_PX)
     found, window = seen, min(2 * round(_CURVED_PX / step) + 1, (len(seen) - 1) | 1)
@@ -327,7 +327,7 @@ class MatchedContours:
     affine: FloatArray
     """(3, 2): a point's displacement is about (x, y, 1) times this [-, and mm]."""
     holes: tuple[tuple[Contour, Contour], ...]
-    """In the reference and in the deformed picture."""
+    """Contours of the same holes in the reference and in the deformed picture."""
     lost: int
     """Holes of the reference that weren't found in the deformed picture."""
 
@@ -342,7 +342,7 @@ def matched_contours(
     """Find each contour of a picture again in another one.
 
     InputError if fewer than half of the holes are found, or fewer than three in a part of a
-    specimen. Contours that are cut are looked for where the holes' affine motion takes them.
+    specimen. Contours that are cut are searched where the holes' affine motion takes them.
     """
     outer, holes, cut, dots = reference.on(grid)
     outer_g, others, cut_g, dots_g = deformed.on(grid)
@@ -382,7 +382,7 @@ def matched_contours(
 def _paired_arcs(
     f: Sequence[Contour], g: Sequence[Contour], affine: FloatArray, reach: float
 ) -> tuple[tuple[Contour, Contour], ...]:
-    """Of contours in two pictures those that are the same, one at least of each pair being cut."""
+    """Pairs of the same contour in two pictures; at least one of each pair is cut."""
     trees, found = [cKDTree(contour.points) for contour in g], []
     for contour in f:
         x = contour.points + _affinely(contour.points, affine)
@@ -398,7 +398,7 @@ def _paired_arcs(
 def _paired_dots(
     f: Sequence[Contour], g: Sequence[Contour], affine: FloatArray
 ) -> tuple[tuple[Contour, Contour], ...]:
-    """Dots in two pictures that are the same: where the holes' affine motion takes them, about."""
+    """Pairs of the same dot in two pictures, near where the holes' affine motion takes it."""
     if not (f and g):
         return ()
     a, b = (np.array([contour.moments[1] for contour in side]) for side in (f, g))
@@ -423,16 +423,16 @@ def _affinely(points: FloatArray, affine: FloatArray) -> FloatArray:
 
 
 def _assigned(a: FloatArray, b: FloatArray, reach: float) -> IntArray:
-    """(k, 2) which of the points a (n, 2) is which of b (m, 2), nearer than a reach."""
+    """(k, 2) indices of points a (n, 2) and b (m, 2) that are the same, nearer than ``reach``."""
     distance = np.linalg.norm(a[:, None] - b, axis=2)
     i, j = linear_sum_assignment(np.minimum(distance, 2.0 * reach))
     return np.asarray(np.stack([i, j], axis=1)[distance[i, j] < reach])
 
 
 def _paired(a: FloatArray, b: FloatArray, whole: bool) -> list[tuple[int, int]]:
-    """Which of the points a (n, 2) is which of b (m, 2), turned, stretched and shifted.
+    """Pairs of indices of points a (n, 2) and the same points in b (m, 2), after a motion.
 
-    Where not all is in view, those in the middle have moved by less than 0.4 of their spacing.
+    If not all is in view, those in the middle have moved by less than 0.4 of their spacing.
     """
     reach = _ALIKE * _spacing(a)
     there, far = (_laid_over(a, b, reach), [np.inf] * _ROUNDS) if whole else (a, _GROWING * reach)
@@ -445,7 +445,7 @@ def _paired(a: FloatArray, b: FloatArray, whole: bool) -> list[tuple[int, int]]:
 
 
 def _laid_over(a: FloatArray, b: FloatArray, reach: float) -> FloatArray:
-    """Points a (n, 2) turned, stretched and shifted so that they lie upon b (m, 2), about."""
+    """Points a (n, 2) rotated, stretched and shifted so that they lie about upon b (m, 2)."""
     best: tuple[float, FloatArray] = (np.inf, a)
     for turn in np.deg2rad(_TURNS_DEG):
         back = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -464,10 +464,10 @@ def displacement_of_plain(
     reference: MaterialContours, image: FloatImage, grid: PixelGrid, body: Body,
     progress: Progress = silent, name: str = "the picture", before: FloatArray | None = None,
 ) -> tuple[NodalResult, MatchedContours]:  # fmt: skip
-    """The displacement in another picture (rows, cols) of a plain specimen, and its contours.
+    """Find the displacement in another picture (rows, cols) of a plain specimen; and contours.
 
-    For the rest see :func:`displacement_between`. InputError, in which the picture has a name, if
-    it shows no plain specimen, or another one.
+    For the other arguments see :func:`displacement_between`. InputError, which names the picture,
+    if it shows no plain specimen, or another one.
     """
     dot_px2 = max((abs(signed_area(points)) for points in reference.dots), default=0.0)
     deformed = plain_surface(image, reference.mask, _DOT_GROWS * dot_px2)
@@ -483,15 +483,15 @@ def displacement_between(
     reference: MaterialContours, deformed: MaterialContours, grid: PixelGrid, body: Body,
     progress: Progress = silent, before: FloatArray | None = None,
 ) -> tuple[NodalResult, MatchedContours]:  # fmt: skip
-    """The displacement between two pictures of which the contours are known, and these.
+    """Find the displacement between two pictures from their contours; and the matched contours.
 
-    Where the reference shows a part only, of what is farther than a cell from the picture's border.
+    If the reference shows only a part, of material farther than a cell from the picture's border.
 
     body : a mesh of the reference's material.
     before : (n, 2) displacement of its nodes [mm] in the picture before, which the iteration begins
         from, by default an affine motion.
 
-    InputError if the contours don't belong together, or don't hold the body.
+    InputError if the contours don't match, or don't hold the body.
     """
     matched = matched_contours(reference, deformed, grid)
     found = _after(matched, body, grid, before, progress)
@@ -510,7 +510,7 @@ def _after(
     matched: MatchedContours, body: Body, grid: PixelGrid, before: FloatArray | None,
     progress: Progress,
 ) -> NodalResult:  # fmt: skip
-    """From the picture before, its affine part that of now; where that leads astray, without."""
+    """Start from the displacement before, its affine part replaced; if that fails, without it."""
     nodes = body.mesh.nodes
     start, found = matched.start(nodes), None
     if before is not None and len(before) == len(nodes):  # of a part in view fewer are known
@@ -530,7 +530,7 @@ def away_from_cuts(mask: BoolArray, grid: PixelGrid, cell_size: float) -> BoolAr
 
 
 def _inner_part(found: NodalResult, mask: BoolArray, reach: float) -> NodalResult:
-    """Elements with a node farther than so much [mm] from where a picture cuts the material."""
+    """Keep elements with a node farther than ``reach`` [mm] from where a picture cuts material."""
     mesh, grid = found.mesh, found.grid
     at = np.rint(grid.to_px(*mesh.nodes.T)).astype(np.int64).T
     row, col = np.clip(at, 0, np.array(mask.shape) - 1).T
@@ -556,12 +556,12 @@ def measure_contours(
 ) -> tuple[MeasuredPhotograph, MatchedContours]:  # fmt: skip
     """Measure a photograph of a specimen without speckle, by its contours, and the modes in it.
 
-    The result is the ansatz fitted to the displacement that contours determine, its covariance that
-    by noise; the refitted ansatz' is by all that this displacement is uncertain by, laws and plates
-    included. ``reference``: what the pair's reference shows; ``name``: of the photograph, for
-    messages; ``before``: the photograph before it, for a start; for the rest see
-    :func:`~modeharvest.idic.photograph.measure.measure`. InputError if the photograph shows no such
-    specimen, or the spectrum contradicts the cell size.
+    The result is the ansatz fitted to the displacement from contours, with a covariance by noise.
+    The refitted ansatz in ``whole`` has a covariance by all uncertainties of this displacement,
+    laws and plates included. ``reference``: contours of the pair's reference; ``name``: of the
+    photograph, for messages; ``before``: the previous photograph, as an initial guess; for the rest
+    see :func:`~modeharvest.idic.photograph.measure.measure`. InputError if the photograph shows no
+    such specimen, or the spectrum contradicts the cell size.
     """
     measured, contours = displacement_of_plain(
         reference, pair.deformed, geometry.grid, body, progress, name,

@@ -1,13 +1,13 @@
-"""Contours of a speckled specimen, and the modes that they alone show, as a second measurement.
+"""Contours of a speckled specimen, and its modes from them alone, as a second measurement.
 
-A pixel at an edge shows b + s (m - b), b the background's grey level around, m the material's just
-inside, and s the share of material that is sought: by least squares over a blur, so that bright
-speckles count and dark ones, which look like background, hardly do. A contour is where s is one
-half. Polynomials along it take away what is finer than the elements whose edges follow it.
+A pixel at an edge shows b + s (m - b), with the background's grey level b around it, the material's
+m just inside, and the share s of material. s is found by least squares over a blur, so that bright
+speckles count, and dark ones, which look like background, hardly do. A contour is where s is one
+half. Polynomials along it remove what is finer than the elements whose edges follow it.
 
-What the speckle does to an edge is random, and rough: how rough the reference's contours are says
-how uncertain they are. Both photographs show the same speckle at an edge, so about half of the
-variance is in common and doesn't count. Of the speckle inside nothing is used.
+The effect of speckle on an edge is random and rough: the roughness of the reference's contours
+shows their uncertainty. Both photographs show the same speckle at an edge, so about half of the
+variance is in common and doesn't count. The speckle inside isn't used.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from modeharvest.util.masks import grown, opened, shrunk
 from modeharvest.util.progress import Progress, silent
 
 ELEMENTS_A_CELL = 5
-"""Along edges."""
+"""Elements per cell, along edges."""
 _SURE_PX, _BAND_PX = 2.0, 3.0
-"""Farther than this from a mask's edge pixels are material or background, whatever the mask is off
-by; and how far from it edges are looked for."""
+"""Pixels farther than this from a mask's edge are material or background, however wrong the mask
+is; and distance from that edge within which edges are searched."""
 _REACH_PX, _AROUND_PX, _BLUR_PX = 1.5, 25.0, 0.7
-"""Gaussian widths: of the material's level, the background's, and the least squares."""
+"""Gaussian widths for the material's level, the background's level, and the least squares."""
 _SMOOTHED = 1.0 / 6.0
-"""Gaussian width of what polynomials are fitted to, over an element's edge."""
+"""Gaussian width of the windows that polynomials are fitted in, over an element's edge."""
 _STEP_PX = 0.5
 _CURVED, _ROUGH = 1.0 / 8.0, 1.0 / 10.0
-"""Gaussian width of parabolas that leave a contour's roughness [cells], and length over which that
-is averaged, longer than speckles are."""
+"""Gaussian width [cells] of the parabolas relative to which a contour's roughness is measured, and
+length over which that is averaged, longer than speckles are."""
 _COMMON = 0.5
-"""Share of the variance that both photographs' contours have in common, about: see
+"""Share of the variance that both photographs' contours have in common: assumed, not measured; see
 docs/explanation/contours_beside.md."""
 _SHOWN_PX = 10.0
 _LEAST_HOLE = 0.1
@@ -65,19 +65,19 @@ class ByContours:
     """The ansatz of a photograph, measured by contours instead of speckle."""
 
     result: Result
-    """With ``errors``: by the contours' noise, and by all that they leave open, as for a specimen
-    without speckle: its law, whether it slides on plates, springs."""
+    """Result with ``errors``: by the contours' noise, and by all that contours leave undetermined,
+    as for a specimen without speckle: its law, whether it slides on plates, springs."""
     speckle: Result
-    """The same by the speckle; of a part in view by that of the same pixels."""
+    """Result by speckle for the same ansatz; of a part in view, on the same pixels."""
     edge_sd_px: float
     """Standard deviation of an edge's displacement, averaged along 10 px [px]."""
 
 
 def body_for_edges(mask: BoolArray, grid: PixelGrid, cell_px: float) -> Body:
-    """A mesh of the material whose edges are as long as contours can tell.
+    """Mesh the material with element edges as long as contours can resolve.
 
-    Without what is narrower than them between a hole and the picture's border: it would make all
-    elements as small.
+    Material between a hole and the picture's border that is narrower than an edge is left out: it
+    would make all elements as small.
     """
     edge = max(4.0, cell_px / ELEMENTS_A_CELL)
     slim = mask & ~opened(mask, 0.5 * edge, at_border=True)
@@ -87,10 +87,10 @@ def body_for_edges(mask: BoolArray, grid: PixelGrid, cell_px: float) -> Body:
 
 
 def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> MaterialContours:
-    """Contours (row, col) of a speckled material in an image (rows, cols); ``mask``: about where.
+    """Find contours (row, col) of a speckled material in an image (rows, cols), near a mask's edge.
 
-    Their noise is what one of two photographs of the same speckle adds to a displacement's.
-    Those of a part in view end at the image's border. InputError if the material shows no edges.
+    Their ``noise`` is what one of two photographs of the same speckle adds to a displacement's. The
+    contours of a part in view end at the image's border. InputError if no edges are found.
     """
     share, weight = _share_of_material(np.asarray(image, np.float32), mask)
     found, cut = contours_around(share - 0.5, mask)
@@ -110,9 +110,9 @@ def edges_of_speckled(image: FloatImage, mask: BoolArray, cell_px: float) -> Mat
 
 
 def _roughness(contours: Sequence[Contour], weight: FloatArray, cell_px: float) -> float:
-    """Variance of contours' distances by speckle, times the length over which they are correlated.
+    """Variance of contours' distances by speckle, times their correlation length [px^3].
 
-    That of means over neighbouring lengths (D. W. Allan's), which shapes hardly add to [px^3].
+    D. W. Allan's variance, of means over neighbouring lengths, to which shapes hardly add.
     """
     squares = []
     for contour in contours:
@@ -159,9 +159,9 @@ def _mean_over(grey: FloatImage, region: BoolArray, width: float) -> FloatImage:
 def _smoothed(
     curve: Contour, weight: FloatArray, width: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """(n, 2) parabolas fitted along a contour, what they leave of it, and the points' step [px].
+    """(n, 2) parabolas fitted along a contour, their residual, and the points' spacing [px].
 
-    Their weights are Gaussian, of a width [px], times the image's; beyond a contour's end none.
+    Their weights are a Gaussian of ``width`` [px] times ``weight``, and 0 beyond a contour's ends.
     """
     x, step = curve.evenly(_STEP_PX)
     w = map_coordinates(weight, x.T, order=1, mode="nearest")
@@ -181,15 +181,15 @@ def measure_by_contours(
     reference: MaterialContours, pair: ImagePair, speckle: Result, cell_size: float, body: Body,
     progress: Progress = silent,
 ) -> ByContours:  # fmt: skip
-    """Measure a result's ansatz by contours alone; the result is where iterations start.
+    """Fit a result's ansatz to contours alone, starting from the result by speckle.
 
-    reference : its contours, by :func:`edges_of_speckled`.
+    reference : contours of the reference, by :func:`edges_of_speckled`.
     pair : the photographs with both masks of the material.
     body : by :func:`body_for_edges`, of the reference's mask.
 
-    Of a part in view the fit is that of what is farther than a cell from the picture's border, by
-    an ansatz for so many cells. InputError if these are too few, if the contours don't belong
-    together, or can't be found.
+    Of a part in view, only what is farther than a cell from the picture's border is fitted, by an
+    ansatz for that number of cells. InputError if there are too few cells, or if the contours can't
+    be found or don't belong together.
     """
     grid, there = pair.grid, pair.masks[1]
     mask = away_from_cuts(pair.masks[0], grid, cell_size)

@@ -43,7 +43,7 @@ class NormalEquations:
     """The quadratic model of the cost 1/2 sum r^2 around some unknowns."""
 
     matrix: FloatArray
-    """(n, n): J'J, where J is minus the derivative of the residual; zero if not asked for."""
+    """(n, n): J'J, where J is minus the derivative of the residual; zero if not requested."""
     gradient: FloatArray
     """(n,): -J'r, the derivative of the cost."""
     cost: float
@@ -67,7 +67,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """What stays the same from one iteration to the next: ansatz, pixels and tables."""
+    """What is constant during the iteration: ansatz, pixels and tables."""
 
     ansatz: Ansatz
     grid: PixelGrid
@@ -85,7 +85,7 @@ class Assembly:
 
     @cached_property
     def runs(self) -> Runs:
-        """Where the pixels that count are."""
+        """The runs of the pixels that count."""
         return runs_of(self.mask)
 
     @cached_property
@@ -99,7 +99,7 @@ class Assembly:
         return [*d, *ansatz.brightness.degrees, 0]
 
     def _pairs(self, with_matrix: bool, component: int) -> NDArray[np.int64]:
-        """All pairs of base fields but zeros; without the matrix those with the residual alone."""
+        """Pairs of base fields that aren't zero; without the matrix only those of the residual."""
         d = self._degrees
         last, first_wave = len(d) - 1, 2 + len(self.ansatz.modes)
         # What is made of the other component's gradient is zero where a displacement is fitted.
@@ -115,7 +115,7 @@ class Assembly:
 
     @cached_property
     def _to_unknowns(self) -> FloatArray:
-        """(primitives, unknowns): how each unknown's sensitivity is made of primitives."""
+        """(primitives, unknowns): combination of primitives that is each unknown's sensitivity."""
         ansatz, parts = self.ansatz, self._primitive_slices
         result = np.zeros((parts[-1].start, ansatz.size))
         slow = ansatz.phi_offset(0)
@@ -148,11 +148,11 @@ class Assembly:
 
         a, reference, deformed : (size,) unknowns, f (rows, cols) in float32 or float64, and g.
         with_matrix : Without the matrix the pass costs about half as much.
-        instrument : (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along
-            x and y [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h
-            being its products with the derivatives of the displacement and of the gain.
-        share : How much of h is the instrument; the rest is g's own [-].
-        runs : Of the pixels those that count; by default all.
+        instrument : (3, rows, cols) in place of (1 + b) times the gradient of g at x + u, along x
+            and y [grey levels/mm], and of g there. Matrix and gradient are h'h and -h'r then, with
+            h its products with the derivatives of the displacement and of the gain.
+        share : Share of the instrument in h; the rest is g's own [-].
+        runs : The pixels that count; by default all those of the mask.
         """
         target = Target.images(reference, deformed, self.grid, instrument, share)
         return self._assemble(a, target, with_matrix, runs or self.runs)
@@ -182,7 +182,7 @@ class Assembly:
         self, a: FloatArray, target: Target, runs: Runs, pairs: NDArray[np.int64], fields: int,
         moments: FloatArray, warped: Warped,
     ) -> int:  # fmt: skip
-        """Fill the moments or ``warped`` by :func:`accumulate`; how many pixels left the image."""
+        """Fill moments or ``warped`` by :func:`accumulate`; returns how many pixels are outside."""
         warped, outside = warped._replace(valid=readable(warped.valid)), np.zeros(BANDS, np.int64)
         tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
         in_parallel(accumulate, target, runs, tables, pairs, fields, moments, outside, warped)
@@ -225,8 +225,8 @@ def valid_pixels(
 ) -> tuple[BoolArray, int]:
     """Keep the pixels that the unknowns map onto material of the deformed image.
 
-    Returns (rows, cols) True on those kept of the assembly's, ``valid`` being where g may be
-    sampled, and the number of the others that are mapped outside the deformed image.
+    Returns (rows, cols) True on those that are kept, and the number of the others that are mapped
+    outside the deformed image. ``valid``: where g may be sampled.
     """
     warped = Warped(valid=valid, kept=assembly.mask.copy())
     return warped.kept, _warp(assembly, a, reference, deformed, warped)
@@ -255,10 +255,10 @@ def warped_back(
 
 
 def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32]) -> None:
-    """Turn slopes at X into those at x = X + u of what moves along: F^-T times them, in place.
+    """Push slopes at X forward to x = X + u: multiply them by F^-T, in place.
 
-    F by central differences of u between neighbouring pixels; pixels beyond those that count are
-    turned, too. The slopes are (2 or more, rows, cols), along x and y first.
+    F by central differences of u between neighbouring pixels; pixels that don't count are
+    transformed, too. The slopes are (2 or more, rows, cols), along x and y first.
     """
     everywhere = Assembly(assembly.ansatz, assembly.grid, np.ones(assembly.grid.shape, np.bool_))
     u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)
@@ -270,7 +270,7 @@ def _warp(
     assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage,
     warped: Warped,
 ) -> int:  # fmt: skip
-    """Fill what is to be left of each pixel; how many are mapped outside the image."""
+    """Fill ``warped``; returns how many pixels are mapped outside the image."""
     ansatz, no_pairs = assembly.ansatz, np.zeros((0, 3), dtype=np.int64)
     target = Target.images(reference, deformed, assembly.grid)
     top = 1 + max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)

@@ -1,10 +1,10 @@
 """Final smoothing: the last level's blur where the model error is large for the speckle size.
 
-A correlation weighs the model error w by the grey-level gradient, as long as w is short against a
-speckle: beyond that the grey levels have nothing more to tell, parts of the image that match badly
-lose their weight, and the result moves away from the best fit of the ansatz. Speckles that are much
-finer than w is long have to be blurred first. What that costs is noise, of which there is little
-against w.
+A correlation weighs the model error w by the grey-level gradient, as long as w is short compared
+with a speckle. Beyond that the grey levels carry no more information, parts of the image that match
+badly lose their weight, and the result moves away from the best fit of the ansatz. Speckles that
+are much finer than w is long have to be blurred first. The price is more noise, of which there is
+little compared with w.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 
 _LONGEST = 64
-"""Lags looked at [px]."""
+"""Lags of the autocorrelation [px]."""
 _SPECKLE_EDGE_PX = 3
 """Pixels closer than this to an edge show some of what is beyond it."""
 _LINES = 256
-"""Rows, and columns, that are enough: neighbouring ones say nearly the same."""
+"""Rows, and columns, that are used: neighbouring ones show nearly the same."""
 
 
 def speckle_size(image: NDArray[Any], mask: BoolArray | None = None) -> float:
     """Full width at half maximum of the autocorrelation of an image's material [px].
 
-    The mask (rows, cols) is True on material; None for everywhere. At most twice the largest lag
-    looked at, 128 px; that for an image without contrast, too.
+    The mask (rows, cols) is True on material; None for everywhere. The size is at most twice the
+    largest lag, 128 px, which is also that of an image without contrast.
     """
     mask = np.ones(image.shape, dtype=np.bool_) if mask is None else mask
     interior = eroded(mask, _SPECKLE_EDGE_PX)
@@ -46,12 +46,12 @@ def speckle_size(image: NDArray[Any], mask: BoolArray | None = None) -> float:
 
 
 def spline_order(speckle_size_px: float) -> int:
-    """The order that a speckle of this size [px] asks for: 5, or 11 if narrower than 6.5 px."""
+    """Order of the spline for a speckle of this size [px]: 5, or 11 if narrower than 6.5 px."""
     return 5 if speckle_size_px >= 6.5 else 11
 
 
 def _autocorrelation(image: NDArray[Any], interior: BoolArray) -> FloatArray:
-    """(_LONGEST,) along the rows, over pairs of pixels that are both inside."""
+    """(_LONGEST,) autocorrelation along the rows, over pairs of pixels that are both inside."""
     lines = np.flatnonzero(interior.any(axis=1))
     lines = lines[:: len(lines) // _LINES + 1]
     values, weights = image[lines], interior[lines]
@@ -64,25 +64,25 @@ def _autocorrelation(image: NDArray[Any], interior: BoolArray) -> FloatArray:
 
 
 def _lagged(values: NDArray[Any], n: int) -> FloatArray:
-    """(_LONGEST,) sums over an image of products of pixels that lag along its rows."""
+    """(_LONGEST,) sums over an image of products of pixels a lag apart along its rows."""
     part = fft.rfft(values.astype(np.float32), n, axis=1)
     power = (part.real**2 + part.imag**2).sum(axis=0, dtype=np.float64)
     return np.asarray(fft.irfft(power, n)[:_LONGEST])
 
 
 WIDTHS = 6.0
-"""Speckles have to be as wide as that many rms lengths of w per component. Where 10 px speckles are
-measured with w of 2 px, the paper's virtual experiment, nothing has to be blurred."""
+"""Least width of speckles over the rms of w per component. In the paper's virtual experiment
+(speckles of 12.2 px, w of 2.0 px) nothing has to be blurred."""
 AROUND = 2.0
-"""How far local mean and contrast reach [blurs]: nearly a single speckle."""
+"""Width over which local mean and contrast are taken [blurs]: nearly a single speckle."""
 _LEAST_BLUR = 1.0
-"""Less than this changes nothing [px]."""
+"""Blurs of less than this change nothing [px]."""
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 @dataclass(frozen=True)
 class FinalSmoothing:
-    """Which images the last level compares."""
+    """The blur of the images that the last level compares."""
 
     speckle_size_px: float
     """Full width at half maximum of the speckle's autocorrelation [px]."""
@@ -102,12 +102,12 @@ class FinalSmoothing:
 
     @classmethod
     def given(cls, pair: ImagePair, blur_px: float) -> FinalSmoothing:
-        """A blur that was chosen without an estimate of the model error."""
+        """Make the smoothing of a given blur, without an estimate of the model error."""
         return cls(speckle_size(pair.reference, pair.mask), np.nan, blur_px)
 
     @property
     def text(self) -> str:
-        """That in words."""
+        """The smoothing in words."""
         start = (
             f"The speckle size (autocorrelation) is {self.speckle_size_px:.1f} px, the model error "
             f"about {self.model_error_px:.2g} px"

@@ -1,16 +1,16 @@
-"""What free edges of a body have in common, learnt from a measured displacement.
+"""Relation between strains at the free edges of a body, learnt from a measured displacement.
 
-Nothing pulls at a free edge. In an isotropic elastic body of one material its normal N is then a
+A free edge carries no traction. In an isotropic elastic body of one material its normal N is then a
 principal direction, and the stretch along N follows from that along the edge, in the same way
 everywhere (R. W. Ogden, Non-Linear Elastic Deformations, 1984). With T along the edge in the
 reference, and n normal to F T,
 
     F N = l^-c n,    l = |F T|,
 
-where strains are small; c, there nu/(1 - nu) in plane strain and nu in plane stress, is learnt from
-all edges. How far they depart from it, edges that aren't free included, is learnt, too, and is the
-standard deviation with which that is known beside the images. An edge whose departure is neither as
-usual nor an error of what was measured is known less well, by a fifth of its departure at least.
+for small strains, with c = nu/(1 - nu) in plane strain and nu in plane stress; c is learnt from all
+edges. The departures of edges from it are learnt, too, including edges that aren't free: they give
+the standard deviation of this relation. For an edge whose departure is neither usual nor an error
+of the measurement that is larger, a fifth of its departure at least.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from modeharvest.util.elements import (
 )
 
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-"""Along a side, from 0 to 1."""
+"""Integration points along a side, from 0 to 1."""
 _LEAST_SIDES = 16
-"""To learn from."""
+"""Fewest sides to learn from."""
 _LEAST = 1e-3
-"""Departure that elements can't do without, and least stretch [-]."""
+"""Least departure, which elements can't avoid, and least stretch [-]."""
 _ROUNDS = 20
-"""Of the fit."""
+"""Iterations of the fit."""
 _UNUSUAL = 5.0
-"""Standard deviations."""
+"""Departure that is unusual [standard deviations]."""
 _NORMAL = 1.4826
 """Standard deviation over the median of absolute values."""
 
@@ -45,8 +45,8 @@ def on_sides(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points on sides of cells (s,), and gradients of the shape functions there.
 
-    ``at`` (g,): of a side, from 0 to 1. Returns points (s, g, 2) [mm], slopes (s, g, k, 2) [1/mm]
-    and what a side goes along (s, g, 2) [mm].
+    ``at`` (g,): positions along a side, from 0 to 1. Returns points (s, g, 2) [mm], slopes (s, g,
+    k, 2) [1/mm] and tangents of the sides, derivatives by ``at`` (s, g, 2) [mm].
     """
     corners = reference_element(mesh.element).nodes[:3]
     begin, along = corners[sides], corners[(sides + 1) % 3] - corners[sides]
@@ -59,12 +59,12 @@ def on_sides(
 
 
 class FreeEdges:
-    """Edges of a T6 mesh but those beside ``inside``: left, right, bottom and top [mm]."""
+    """Edges of a T6 mesh that lie within ``inside``: left, right, bottom and top [mm]."""
 
     exponent = 0.0
-    """c [-]."""
+    """The exponent c [-]."""
     deviation: tuple[float, ...] = ()
-    """Standard deviations of F N along n and along F T from what c says [-]; none of few edges."""
+    """Standard deviations of F N along n and F T from the relation [-]; empty for few edges."""
 
     def __init__(self, mesh: Mesh, inside: tuple[float, float, float, float]) -> None:
         middle = mesh.cells[:, 3:]
@@ -82,7 +82,7 @@ class FreeEdges:
         self.frame = np.stack([T, T[..., ::-1] * [1.0, -1.0]])
         """(2, s, g, 2) T and N at points of each side."""
         self.slopes = np.einsum("sgki,fsgi->fsgk", slopes[there], self.frame)
-        """(2, s, g, k) of the shape functions along T and N [1/mm]."""
+        """(2, s, g, k) slopes of the shape functions along T and N [1/mm]."""
         self.nodes, self._count = mesh.cells[cell[there]], len(mesh.nodes)
 
     def _turned(self, u: FloatArray) -> tuple[FloatArray, ...]:
@@ -94,7 +94,7 @@ class FreeEdges:
         return length, t, n, (FN * n).sum(axis=-1), (FN * t).sum(axis=-1)
 
     def learn(self, u: FloatArray, uncertain: FloatArray) -> None:
-        """Learn c, and how far u (2 n,) [mm] departs from what it says.
+        """Learn c, and the departures of u (2 n,) [mm] from the relation.
 
         ``uncertain`` (2 n, k): vectors whose outer products sum up to the covariance of u [mm^2].
         """
@@ -116,11 +116,11 @@ class FreeEdges:
         self.deviation = tuple(map(float, np.sqrt(usual.ravel())))
         known = np.median(variance.reshape(2, -1), axis=1)[:, None, None]
         self._beyond = np.sqrt(np.maximum(1.0 - known / usual, 0.0))
-        # The two points of a side know the same.
+        # The two points of a side carry the same information.
         self._root = np.sqrt(0.5 / usual / (1.0 + unusual.mean(axis=2, keepdims=True)))
 
     def linearised(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sums of dd' and of -dr, (2 n,), of departures r of u, over their variance.
+        """Sums of dd' and of -dr (2 n,), r departures of u, d their derivatives, over the variance.
 
         The first in blocks (s, 4, 6, 6) of xx, xy, yx and yy, over the ``nodes`` of each side.
         """
@@ -129,19 +129,19 @@ class FreeEdges:
         return blocks.reshape(-1, 4, 6, 6), -self._sums(slopes, off[..., None])[:, 0]
 
     def samples(self, u: FloatArray, count: int) -> FloatArray:
-        """(2 n, count) random vectors of what departures beyond errors of the learnt one do."""
+        """(2 n, count) random vectors by departures beyond those due to errors of the learnt u."""
         slopes, _ = self._weighed(u)
         z = np.random.default_rng(2).standard_normal((len(slopes), 2, 2, count))
         return self._sums(slopes, (self._beyond * z).reshape(-1, 4, count))
 
     def _weighed(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(s, 4, 12) derivatives of departures by u, and (s, 4) these, over their deviation."""
+        """(s, 4, 12) derivatives of departures by u, (s, 4) departures, over their deviation."""
         slopes, off = self._departures(u)
         slopes, off = self._root[..., None] * slopes, self._root * off
         return np.moveaxis(slopes, 0, 1).reshape(-1, 4, 12), np.moveaxis(off, 0, 1).reshape(-1, 4)
 
     def _departures(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(2, s, g, 12) derivatives of departures by u [1/mm], and (2, s, g) these [-]."""
+        """(2, s, g, 12) derivatives of departures by u [1/mm], and (2, s, g) departures [-]."""
         length, t, n, normal, shear = self._turned(u)
         c, (along, across) = self.exponent, self.slopes[..., None]
         per, t, n = 1.0 / length[..., None, None], t[:, :, None], n[:, :, None]

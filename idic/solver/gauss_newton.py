@@ -5,9 +5,9 @@ stored matrix with more damping, until the cost falls. The matrix is scaled to a
 and decomposed into eigenvectors; directions the images say nothing about (the mode's
 parameters where v is zero) get no step instead of an enormous one.
 
-Once steps are short, J'J hardly changes, and what it lacks of the Hessian makes convergence
-linear. So it is no longer assembled but corrected by what each step does to the gradient
-(Broyden, Fletcher, Goldfarb & Shanno): cheaper iterations, and fewer. J'J itself is assembled
+Once steps are short, J'J hardly changes, and its difference from the Hessian makes convergence
+linear. From then on it isn't assembled, but corrected by the change of the gradient in each step
+(Broyden, Fletcher, Goldfarb & Shanno): iterations are cheaper, and fewer. J'J itself is assembled
 again where the iteration ends.
 """
 
@@ -79,7 +79,7 @@ _EXPLANATIONS = {
 
 @dataclass(frozen=True)
 class GaussNewtonOptions:
-    """When to stop, and how patient to be."""
+    """Tolerances and limits of the iteration."""
 
     tolerance_px: float = 1e-4
     """Converged once a step changes the displacement by less than this, rms [px]. The error left is
@@ -87,11 +87,11 @@ class GaussNewtonOptions:
     coarse_tolerance_px: float = 1e-2
     """The same in *binned* px on the coarse levels, which only have to lead to the next."""
     tolerance_errors: float = 0.01
-    """Converged, too, where no step lowers the cost any more and the last one was that short, rms
-    over the unknowns in standard errors, the residual being taken for noise: the relative offset of
+    """Also converged if no step lowers the cost any more and the last one is shorter than this, rms
+    over the unknowns in standard errors, with the residual taken for noise: the relative offset of
     Bates & Watts, Technometrics 23 (1981), doi 10.1080/00401706.1981.10486254."""
     max_iterations: int = 50
-    """On each level."""
+    """Most iterations on each level."""
     max_outside: float = 0.2
     """Fraction of the pixels that may be mapped outside the deformed image [-]."""
 
@@ -115,7 +115,7 @@ class Iteration:
     factor: int
     """Binning of the level [px]."""
     number: int
-    """From 1 on each level, and again whenever the pixels used are chosen anew."""
+    """Counted from 1 on each level, and again whenever the pixels used are chosen anew."""
     mean_square: float
     """Mean of r^2 after the step."""
     step_px: float
@@ -127,10 +127,10 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the iteration ended, and how."""
+    """The point where the iteration ended, and its outcome."""
 
     unknowns: FloatArray
-    """(n,): the best ones found."""
+    """(n,): the best unknowns found."""
     equations: NormalEquations
     outcome: Outcome
     history: tuple[Iteration, ...]
@@ -160,13 +160,13 @@ def minimise(
 ) -> Minimum:  # fmt: skip
     """Minimise 1/2 sum r^2.
 
-    evaluate : The normal equations at some unknowns, and whether with the matrix.
+    evaluate : Makes the normal equations at given unknowns, with their matrix or without.
     step_length : Rms difference of the displacement between two sets of unknowns [px].
-    start : (n,) unknowns.
-    options : When to stop.
-    factor : Binning.
+    start : (n,) initial unknowns.
+    options : Tolerances and limits.
+    factor : Binning of the level [px].
     on_iteration : Called with the number of each finished iteration.
-    curvature : (n, n) what to begin with in place of J'J, if something is known already.
+    curvature : (n, n) initial curvature in place of J'J, if it is known already.
     eigenvalue_cutoff : Directions with an eigenvalue below this share of the largest one get no
         step [-].
     """
@@ -194,20 +194,20 @@ def minimise(
 
 @dataclass(frozen=True, eq=False)
 class _SearchPoint:
-    """Where the iteration is, and what it knows there."""
+    """The present unknowns, and what is known of the cost there."""
 
     a: FloatArray
     equations: NormalEquations
     is_assembled: bool
     curvature: FloatArray
     has_fallen: bool = True
-    """Whether the cost still falls a lot: then Gauss-Newton's own matrix is the best."""
+    """Whether the cost still falls a lot: then the Gauss-Newton matrix itself is the best."""
     damping: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class _TrialStep:
-    """A step from one point to another, and whether it was good enough to be taken."""
+    """A step from one point to another, and whether it is accepted."""
 
     to: _SearchPoint
     length_px: float
@@ -220,7 +220,7 @@ def _descend(
     at: _SearchPoint, evaluate: Evaluate, step_length: StepLength, options: GaussNewtonOptions,
     short_px: float, eigenvalue_cutoff: float,
 ) -> _TrialStep:  # fmt: skip
-    """Take a step that lowers the cost, damped as much as it takes."""
+    """Take a step that lowers the cost, damped as much as necessary."""
     eigen, damping = ScaledEigen.of(at.curvature), at.damping
     while True:
         a = at.a - eigen.solve(at.equations.gradient, damping, eigenvalue_cutoff)
@@ -256,9 +256,9 @@ def _ending(step: _TrialStep, number: int, options: GaussNewtonOptions) -> Outco
 
 
 def corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
-    """The matrix with the curvature observed along a step: matrix . step = change of the gradient.
+    """Correct a matrix by the curvature seen along a step: matrix . step = change of gradient.
 
-    As it was where the gradient shows no positive curvature.
+    Returned unchanged where the gradient shows no positive curvature.
     """
     product = matrix @ step
     curvature, observed = float(step @ product), float(step @ change)
@@ -269,7 +269,7 @@ def corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> Float
 
 
 def standard_errors(step: FloatArray, curvature: FloatArray, at: NormalEquations) -> float:
-    """How long a step is, rms over the unknowns, in their standard errors by the residual."""
+    """Length of a step in the unknowns' standard errors, which follow from the residual; rms."""
     squares = max(0.0, float(step @ curvature @ step))
     if not at.mean_square > 0.0:
         return np.inf

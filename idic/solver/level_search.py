@@ -3,8 +3,8 @@
 The set of pixels is frozen while the cost is minimised: pixels that came and went with every
 step would make the cost jump, and the iteration stagnate. It is chosen anew at the minimum.
 
-Where there are far more pixels than it takes to find the unknowns, every few rows lead most of
-the way, and hand over what they know of the cost's curvature.
+If there are far more pixels than are needed to find the unknowns, the iteration first runs on one
+row of a few, and hands over the curvature of the cost that it found.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from modeharvest.util.arrays import BoolArray, FloatArray
 _ROUNDS, _SETTLED = 5, 1e-2
 """The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
 _PLENTY, _STRIDE = 1000, 4
-"""Pixels an unknown that suffice to lead the way, and of how many rows one is taken then."""
+"""Pixels per unknown that suffice for a first iteration, and the stride of its rows."""
 _EIGENVALUE_CUTOFF = 1e-3
-"""On coarse levels, directions with an eigenvalue below this share of the largest one wait for
-the finest level: what a blur does to the images would send them into other valleys."""
+"""On coarse levels, directions with an eigenvalue below this share of the largest one get no step
+before the finest level: the blur of the images would lead them to other minima."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +50,16 @@ class LevelSearch:
     ansatz: Ansatz
     level: Level
     finest: bool
-    """Whether all unknowns are sought to the full tolerance; or to lead to the next level."""
+    """Whether to solve for all unknowns to the full tolerance, or to lead to the next level."""
     options: GaussNewtonOptions
     on_iteration: Callable[[int], None]
     """Called with the number of each finished iteration."""
 
     def lower_cost(self, a: FloatArray, before: FloatArray) -> FloatArray:
-        """Choose what has the lower cost: the last level's unknowns, or those it began with.
+        """Choose the unknowns of lower cost: the last level's, or those that it began with.
 
         A speckle that is too fine for a coarse blur leaves no information there, and the level
-        leads astray; this takes its steps back.
+        leads to a wrong place; this undoes its steps.
         """
         if np.array_equal(a, before):
             return a
@@ -68,7 +68,7 @@ class LevelSearch:
         return a if costs[0] <= costs[1] else before
 
     def minimum(self, start: FloatArray) -> tuple[Minimum, Assembly]:
-        """Find it, and the pixels it was found with."""
+        """Find the minimum, and the pixels that it was found with."""
         assembly = self.valid_assembly(start)
         history: tuple[Iteration, ...] = ()
         curvature = None
@@ -95,7 +95,7 @@ class LevelSearch:
     def reweighed(
         self, found: Minimum, used: Assembly, instrument: NDArray[Any]
     ) -> tuple[Minimum, Propagation]:
-        """Move on from the minimum to where an instrument weighs the residual to zero.
+        """Iterate from the minimum to the root of h'r = 0, with weights h by an instrument.
 
         ``used`` are the minimum's pixels, the instrument is (3, rows, cols) as for
         :meth:`Assembly.images`.
@@ -126,7 +126,7 @@ class LevelSearch:
         return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
 
     def _thinned(self, assembly: Assembly) -> Assembly:
-        """One row of a few, if that leaves plenty of pixels."""
+        """Take one row in four, if that leaves plenty of pixels; otherwise all."""
         if assembly.runs.pixels < _STRIDE * _PLENTY * self.ansatz.size:
             return assembly
         rows = np.zeros_like(assembly.mask)
@@ -141,10 +141,10 @@ class LevelSearch:
         *,
         leads: bool,
     ) -> Minimum:
-        """Go to the full tolerance, or to a coarse one that is enough to lead the way.
+        """Minimise to the full tolerance, or with ``leads`` to a coarse one.
 
-        The share of pixels that may leave is one of the whole material: those left out at g's
-        border and at its holes are not to weigh as if they had left.
+        The allowed share of pixels outside the image refers to the whole material: pixels left out
+        at g's border and at its holes must not count as if they were outside.
         """
         limits, factor = self.options, self.level.factor
         rows = np.diff(assembly.runs.row_start) > 0 if assembly.runs.pixels else slice(None)
@@ -179,7 +179,7 @@ def step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -
 
     @lru_cache(maxsize=2)
     def displacement(a: bytes) -> FloatArray:
-        """Where one step ends the next one begins."""
+        """Cached: the end of a step is the beginning of the next one."""
         return ansatz.displacement(np.frombuffer(a), x, y)
 
     def length(a: FloatArray, b: FloatArray) -> float:

@@ -1,9 +1,9 @@
 """Image noise, given, measured or estimated, and its propagation to residual and unknowns.
 
-A spline passes through every pixel, so that between pixels it is a weighted mean of their noise,
-and smoother: of variance 1 at pixels, of about 0.4 in the middle between four of them. Its slope's
-variance depends on the place likewise. And where the material has shrunk, fewer pixels of g look
-at the same material, so its noise weighs more: by 1/det F.
+A spline passes through every pixel. Between pixels it is a weighted mean of their noise, and of
+less variance: 1 at pixels, 0.70 (quintic; cubic 0.57) in the middle between four of them. The
+variance of its slope depends on the place likewise. Where the material has shrunk, fewer pixels of
+g show the same material, so that g's noise has more weight: by 1/det F.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 
 _OTHER_STATE = 0.25
-"""Share of an exposure's variance that noise alone can hardly make: speckle has far more."""
+"""Largest share of an exposure's variance that is taken for noise: speckle has far more."""
 _MOTION = 2.0
-"""Times the noise that a single image shows, beyond which motion is the likelier cause."""
+"""Ratio to the noise seen in a single image beyond which motion is the likelier cause."""
 
 GIVEN = "given"
 """Source of a noise that the experiment's file states."""
 _REACH = 24
-"""How far from a pixel the spline through it is looked at [px]."""
+"""Distance from a pixel to which its influence on the spline is followed [px]."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class CameraNoise:
     sd: float
     """Standard deviation over the material [grey levels]."""
     source: str
-    """Where it is known from, in words."""
+    """Source of the value, in words."""
 
 
 def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> CameraNoise:
     """Measure the noise from exposures of one and the same state, the reference first.
 
-    Half the variance of what is left of one when the other has been fitted to it by a gain and an
-    offset (the lamp may have flickered), pooled over neighbours in the series. Images and mask,
+    It is half the variance of the residual after one exposure was fitted to the next by a gain and
+    an offset (the lamp may have flickered), pooled over neighbours in the series. Images and mask,
     True on material, are (rows, cols); raises InputError if two exposures have so little in common
     that they are of different states.
     """
@@ -75,11 +75,11 @@ def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> C
 
 
 def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise:
-    """Estimate the noise from a single image (rows, cols), by what no smooth pattern shows.
+    """Estimate the noise from a single image (rows, cols), by details finer than any pattern.
 
     The difference of two Laplacians weighs white noise by 6 and a pattern by (k_x k_y)^2, k its
-    wave number in rad/px. Too large where the speckles are of 2 px or so themselves. The mask is
-    True on material.
+    wave number in rad/px. The estimate is too large if speckles are about 2 px themselves. The mask
+    is True on material.
 
     Source: J. Immerkaer, Comput. Vis. Image Underst. 64 (1996), doi 10.1006/cviu.1996.0060.
     """
@@ -95,7 +95,7 @@ def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise
 _ACROSS = 128
 """Rows and columns, at most, over which means are taken: displacements vary slowly."""
 _LEAST_DET = 0.1
-"""No material shrinks to less than that: what does is an iteration gone astray."""
+"""Least det F: a material that shrinks more is that of a diverging iteration."""
 _PHASES = 64
 """Positions between two pixels at which a spline's noise is tabulated."""
 
@@ -123,7 +123,7 @@ class ImageNoise:
 
 @dataclass(frozen=True)
 class NoiseTransfer:
-    """What reaches the residual f(x) - g(x + u) of white noise of variance 1 in g.
+    """Transfer of white noise of variance 1 in g to the residual f(x) - g(x + u).
 
     Means over the pixels compared. The defaults are those of g sampled at its pixels.
     """
@@ -133,13 +133,13 @@ class NoiseTransfer:
     slope: float = 0.0
     """Variance of its slope along an axis [1/px^2]."""
     density: float = 1.0
-    """1/det F: pixels of the reference that share a pixel of g [-]."""
+    """1/det F: pixels of the reference for each pixel of g [-]."""
 
     @classmethod
     def of(
         cls, ansatz: Ansatz, a: FloatArray, grid: PixelGrid, mask: BoolArray, order: int
     ) -> NoiseTransfer:
-        """Look where the compared pixels, True in ``mask`` (rows, cols), are mapped."""
+        """Take the places where the compared pixels, True in ``mask`` (rows, cols), are mapped."""
         rows, cols, some = subsampled(mask)
         if not some.any():
             return cls()
@@ -156,8 +156,8 @@ class NoiseTransfer:
 
     @classmethod
     def at(cls, u_px: FloatArray, det: FloatArray, order: int) -> NoiseTransfer:
-        """Of whole pixels displaced by (k, 2) [px], det F there (k,), and a spline's order."""
-        # Whole pixels make no difference to where between pixels a position is.
+        """Take pixels displaced by ``u_px`` (k, 2) [px], with det F (k,), and a spline's order."""
+        # Whole pixels don't change the position between pixels.
         (w_x, s_x), (w_y, s_y) = (_variances(order, u_px[:, c] % 1.0) for c in (0, 1))
         return cls(
             float(np.mean(w_x * w_y)),
@@ -184,7 +184,7 @@ def spline_autocorrelation(
     """(2, lags) autocorrelation of white noise in g, sampled at x + u, down columns, along rows.
 
     The mean over the compared pixels, True in ``mask`` (rows, cols); pixels some lag [px] apart
-    are taken to lie alike between those of g.
+    have the same position between pixels of g.
     """
     rows, cols, some = subsampled(mask)
     if not some.any():
@@ -204,8 +204,8 @@ def spline_autocorrelation(
 def slope_noise(order: int, blur_px: float) -> float:
     """Variance at a pixel of the slope of white noise of variance 1, blurred first [1/px^2].
 
-    The order is that of the spline whose slope it is. Of a Gaussian blur of standard deviation s,
-    from 0.6 px on, that is 1/(8 pi s^4), to 11 % at 0.6 px, 4 % at 0.8 px and 1 % at 1 px.
+    ``order``: of the spline whose slope it is. For a Gaussian blur of standard deviation s, from
+    0.6 px on, this is 1/(8 pi s^4), to 11 % at 0.6 px, 4 % at 0.8 px and 1 % at 1 px.
     """
     if blur_px > 0.0:
         return float(1.0 / (8.0 * np.pi * blur_px**4))
@@ -215,14 +215,14 @@ def slope_noise(order: int, blur_px: float) -> float:
 def _variances(order: int, phase: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Variances along an axis of interpolated noise of variance 1 and of its slope.
 
-    The phase, 0 ... 1, is where between two pixels.
+    The phase, 0 ... 1, is the position between two pixels.
     """
     value, slope = _table(order)
     return _between(value, phase), _between(slope, phase)
 
 
 def _between(table: FloatArray, phase: FloatArray) -> FloatArray:
-    """Linearly between the values of a table at even phases 0 ... 1: no search, as np.interp's."""
+    """Interpolate a table at even phases 0 ... 1 linearly, without the search of np.interp."""
     at = _PHASES * phase
     low = np.minimum(at.astype(np.int64), _PHASES - 1)
     return np.asarray(table[low] + (at - low) * np.diff(table)[low])
@@ -230,21 +230,21 @@ def _between(table: FloatArray, phase: FloatArray) -> FloatArray:
 
 @cache
 def _table(order: int) -> tuple[FloatArray, FloatArray]:
-    """Both at the phases 0 ... 1: sums of squares of the spline through a single 1."""
+    """Both variances at phases 0 ... 1: sums of squares of the spline through a unit impulse."""
     value, slope = _impulse(order)
     return (value**2).sum(axis=1), (slope**2).sum(axis=1)
 
 
 @cache
 def _autocovariances(order: int) -> FloatArray:
-    """(lags, phases) of interpolated noise of variance 1, along an axis, a few pixels apart."""
+    """(lags, phases) autocovariance along an axis of interpolated noise of variance 1."""
     value, _ = _impulse(order)
     n = value.shape[1]
     return np.array([(value[:, : n - lag] * value[:, lag:]).sum(axis=1) for lag in range(_REACH)])
 
 
 def _impulse(order: int) -> tuple[FloatArray, FloatArray]:
-    """(phases 0 ... 1, positions a pixel apart) the spline through a single 1, and its slope."""
+    """(phases 0 ... 1, positions a pixel apart) spline through a unit impulse, and its slope."""
     impulse = np.zeros((2 * _REACH + 1, 2 * _REACH + 1))
     impulse[_REACH, _REACH] = 1.0
     spline = SplineImage.of(impulse, order, np.float64)

@@ -12,8 +12,8 @@ fields. The base fields, D being the total degree of the products that multiply 
     1                           only with an offset among the unknowns          D = its degree
     r                           the residual                                    D = 0
 
-The deformed image is taken at x + u. About 250 multiply-adds a pixel for 77 unknowns, where the
-Jacobian's product needs 3 000; J'r alone needs 60. The rows are dealt to a fixed number of
+The deformed image is taken at x + u. About 250 multiply-adds per pixel are needed for 77 unknowns,
+3 000 for the Jacobian's product, 60 for J'r alone. The rows are divided into a fixed number of
 bands whose sums are added in order, so the result does not depend on the number of threads.
 """
 
@@ -78,11 +78,11 @@ class Runs(NamedTuple):
 
     @property
     def pixels(self) -> int:
-        """How many pixels count."""
+        """Number of pixels that count."""
         return int((self.stop - self.first).sum())
 
     def within(self, top: int, left: int, side: int) -> Runs:
-        """Those pixels that lie in a square block; of some runs nothing is left."""
+        """The pixels that lie in a square block; some runs become empty."""
         begin, end = self.row_start[[top, min(top + side, len(self.row_start) - 1)]]
         first, stop = (np.clip(k[begin:end], left, left + side) for k in (self.first, self.stop))
         return Runs(first, stop, np.clip(self.row_start, begin, end) - begin)
@@ -99,16 +99,16 @@ class Tables(NamedTuple):
     v: NDArray[Any]
     """(2, D0 + 1, D0 + 1) and (n, D + 1, D + 1): Chebyshev coefficients [i, j] [mm]."""
     brightness: NDArray[Any]
-    """(2, D + 1, D + 1): those of the gain b [-] and of the offset c [grey levels]."""
+    """(2, D + 1, D + 1): coefficients of the gain b [-] and of the offset c [grey levels]."""
     gain_field: int
     offset_field: int
-    """Numbers of their base fields; 0 where they are no unknowns."""
+    """Numbers of the base fields of gain and offset; 0 where they are not unknowns."""
     waves: NDArray[Any]
     mode_of_wave: NDArray[Any]
     """(w, 6): A, B, kx, ky, c, pi/l; (w,): the mode each belongs to."""
     sin_y: NDArray[Any]
     cos_y: NDArray[Any]
-    """(w, rows) of pi/l (ky y + c)."""
+    """(w, rows) sine and cosine of pi/l (ky y + c)."""
     taper_y: NDArray[Any]
     """(n, rows) tau_y."""
 
@@ -223,11 +223,11 @@ _NOWHERE = np.zeros((0, 0), dtype=np.bool_)
 
 
 class Warped(NamedTuple):
-    """What a pass leaves of each pixel instead of moments; empty where there is nothing to leave.
+    """Output of a pass for each pixel, in place of moments; arrays that aren't wanted are empty.
 
-    ``valid`` tells where g may be sampled; which pixels are mapped there is filled into ``kept``
-    (both (rows, cols)), into ``fields`` (k, rows, cols) the residual if k is 1, u if it is 2, if it
-    is 3 slopes and residual.
+    ``valid`` (rows, cols) is where g may be sampled. ``kept`` (rows, cols) is filled with whether a
+    pixel is mapped there, and ``fields`` (k, rows, cols) with the residual if k is 1, u if it is 2,
+    slopes and residual if it is 3.
     """
 
     valid: NDArray[Any] = _NOWHERE
@@ -248,7 +248,7 @@ def _mark_valid(n: int, own: Any, valid: Any, kept: Any) -> int:
 
 @compiled(inner=True, relaxed=True)
 def _leave_block(row: int, n: int, own: Any, E: Any, fields: Any) -> None:
-    """Fill rows of the fields that are left, in turn those of u or those of E that are last."""
+    """Fill rows of the output fields: the components of u if these are two, else the last of E."""
     for k in range(fields.shape[0]):
         values = own[U_X + k] if fields.shape[0] == 2 else E[k + 3 - fields.shape[0]]
         for m in range(n):
@@ -269,7 +269,7 @@ def accumulate(
     moments, outside : (bands, pairs, K + 1, K + 1) sums of each band of rows, and (bands,) how
         many pixels are mapped outside the image; both zero on entry.
     warped : :class:`Warped`, to be filled instead if it isn't empty, by the same compiled pass.
-    first, every : The bands to look at: each ``every``-th from ``first`` on.
+    first, every : The bands to sum: each ``every``-th from ``first`` on.
     """
     rows, bands = runs.row_start.size - 1, moments.shape[0]
     for band in range(first, bands, every):

@@ -34,17 +34,17 @@ class Target(NamedTuple):
     """IMAGES: residual f - (1 + b) g(x + u) - c. 0 or 1: residual ``displacement`` - u_x or u_y,
     and (1, 0) or (0, 1) in place of the gradient."""
     reference: NDArray[Any]
-    """(rows, cols) f; of no account for a displacement."""
+    """(rows, cols) f; unused for a displacement."""
     coefficients: NDArray[Any]
     order: int
     """Spline of g."""
     displacement: NDArray[Any]
-    """(rows, cols) [mm]; of no account for images."""
+    """(rows, cols) [mm]; unused for images."""
     instrument: NDArray[Any]
-    """(3, rows, cols) what weighs the residual in place of (1 + b) times the gradient of g at x +
-    u, along x and y [grey levels/mm], and of g there; (3, 0, 0) for these themselves."""
+    """(3, rows, cols) weights in place of (1 + b) times the gradient of g at x + u, along x and y
+    [grey levels/mm], and of g there; (3, 0, 0) for these themselves."""
     share: float
-    """How much of what weighs is the instrument; the rest is g's own [-]."""
+    """Share of the instrument in the weights; the rest is g's own [-]."""
     pixel_size: float
     """[mm/px]."""
 
@@ -82,7 +82,7 @@ INSTRUMENT = 12
 
 
 class PixelBlock(NamedTuple):
-    """Some pixels of a row, and what the passes know of them; every last axis is the pixels'.
+    """Some pixels of a row, and results of the passes for them; the last axis is the pixels'.
 
     Few arrays with numbered rows, because the compiler counts references to each of them.
     """
@@ -92,7 +92,7 @@ class PixelBlock(NamedTuple):
     levels]; x + u as row and column [px]; g there and its derivatives; 1, or 0 outside g; the three
     of the instrument."""
     along_x: NDArray[Any]
-    """(1 + 2 w + n, BLOCK): those of the tables."""
+    """(1 + 2 w + n, BLOCK): the tables' ``along_x``."""
     T: NDArray[Any]
     eta_T: NDArray[Any]
     """(K + 1, BLOCK) T_a(xi); (K + 1,) T_b(eta) of the row."""
@@ -117,7 +117,7 @@ def new_block(tables: Any, degree: int, fields: int) -> PixelBlock:
 
 @compiled(inline=True, relaxed=True)
 def start_row(runs: Any, tables: Any, row: int, block: Any) -> tuple[int, int]:
-    """T_b(eta) of a row; the number of its first run and the column where that begins."""
+    """Fill T_b(eta) of a row; returns its first run's number and the column where that begins."""
     eta_T, run = block.eta_T, runs.row_start[row]
     eta_T[0], eta_T[1] = 1.0, tables.eta[row]
     for b in range(2, eta_T.size):
@@ -129,7 +129,7 @@ def start_row(runs: Any, tables: Any, row: int, block: Any) -> tuple[int, int]:
 def take_block(
     target: Any, runs: Any, tables: Any, row: int, run: int, begin: int, block: Any
 ) -> tuple[int, int, int]:
-    """Gather the next pixels of a row; how many, and where the rest begins."""
+    """Gather the next pixels of a row; returns how many, and where the rest begins."""
     n, last = 0, runs.row_start[row + 1]
     while n < BLOCK and run < last:
         length = min(BLOCK - n, runs.stop[run] - begin)
@@ -146,7 +146,7 @@ def take_block(
 def _gather(target: Any, row: int, first: int, n: int, at: int, tables: Any, block: Any) -> None:
     """Append a run to a block, from its place ``at`` on.
 
-    Runs are copied rather than pixels picked one by one: that goes by whole vectors.
+    Runs are copied rather than pixels picked one by one, because that is vectorised.
     """
     # Through views whose indices begin at 0: others might be negative for all the compiler knows.
     column, known = block.own[COLUMN, at : at + n], block.own[KNOWN, at : at + n]

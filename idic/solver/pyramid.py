@@ -113,22 +113,22 @@ class Level:
 
 
 FULL = Level(1, 0.0)
-"""The unfiltered images."""
+"""The finest level: the unfiltered images."""
 COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL)
 """Blurs of 24, 12, 6 and 0 px."""
 
 FELT, _MOST = 2e-3, 1 / 16
-"""On the finest level no pixel counts that is mapped to where the spline of g feels the mirror
-image beyond the border by more than 0.2 % of its pull: 8 px for a quintic spline, 5 for a cubic.
-The rest of it moves float images by 5e-6 px. At most a sixteenth of the image's shorter side: in
-the strip left out, polynomials are extrapolated, which costs more on small images than it mends."""
+"""On the finest level no pixel counts that is mapped to where the spline of g depends on the mirror
+image beyond the border by more than 0.2 %: 8 px for a quintic spline, 5 for a cubic. The rest of
+that influence moves float images by 5e-6 px. The strip is at most a sixteenth of the image's
+shorter side: polynomials are extrapolated in it, which costs small images more than it mends."""
 _CONTINUED = 1.5
 """Blur that continues the material into holes on a level without blur of its own [binned px]."""
 _FAR = np.float32(1e-4)
 """Share of material below which a place is far from any, and takes the mean grey level."""
 
 _AROUND = 3.0
-"""How far the local mean and contrast reach, in blurs: nothing finer than the blur is lost."""
+"""Width of the local mean and contrast, in blurs: nothing finer than the blur is lost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +151,10 @@ def level_pair(
 ) -> LevelPair:
     """Make one level of a pair of images.
 
-    Holes are kept out of the blur only if both masks are known: they have to look alike in both.
+    Holes are kept out of the blur only if both masks are known: f and g have to be treated alike.
 
     edge_px : Pixels closer than this to the mask's edge are left out on the finest level [px].
-    order : Of the spline: 3, 5 or 11.
+    order : Order of the spline: 3, 5 or 11.
     normalised : Give both images a local mean of 0 and a local contrast of 1, so that differences
         of brightness that vary slowly are gone; for blurred levels only.
     """
@@ -187,7 +187,7 @@ def _valid(mask: BoolArray | None, shape: tuple[int, int], edge_px: int, order: 
 
 
 def eroded(mask: BoolArray, distance_px: int) -> BoolArray:
-    """Take away the pixels within ``distance_px`` of the mask's edge; the image border is none."""
+    """Remove pixels within ``distance_px`` of the mask's edge; the image's border isn't one."""
     if distance_px < 1 or mask.all():
         return mask
     for _ in range(2):  # along the rows, then along what were the columns
@@ -218,8 +218,8 @@ def _smooth(image: FloatImage, weight: BoolArray | None, level: Level) -> FloatI
 def locally_normalised(image: FloatImage, blur: float, around: float = _AROUND) -> FloatImage:
     """Give an image blurred by ``blur`` px a local mean of 0 and a local contrast of 1.
 
-    Where all speckles count alike, the model error weighs alike everywhere. ``around`` is how far
-    the local mean and contrast reach [blurs].
+    All speckles count alike then, and the model error has the same weight everywhere. ``around``:
+    width over which local mean and contrast are taken [blurs].
     """
     around *= blur
     image = image - blurred(image, around)

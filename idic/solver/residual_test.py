@@ -1,12 +1,12 @@
 """Residual test: is a residual white noise, and which fraction of the image is decorrelated.
 
-Noise has no correlation from one pixel to another a few pixels off, but what the spline makes of
-that of g between its pixels, which is known; a model error shows the speckle's own gradient, which
-is correlated over a speckle. So the residual's autocorrelation separates the two without knowing
-the noise; where that is known, chi squared does, too.
+Noise is uncorrelated between pixels some pixels apart, except for the correlation that the spline
+causes in g between its pixels, which is known. A model error shows the speckle's own gradient,
+which is correlated over a speckle. So the residual's autocorrelation separates the two without
+knowing the noise; if the noise is known, chi squared does so, too.
 
-NaN is where no pixel counts. Each row, or row of blocks, is summed on its own, so the result does
-not depend on the number of threads.
+Residuals are NaN where no pixel counts. Each row, or row of blocks, is summed on its own, so the
+result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from modeharvest.util.errors import InputError
 def lagged_products(
     residual: Any, lags: Any, products: Any, counts: Any, thread: int, threads: int
 ) -> None:
-    """Sum residual (rows, cols) times residual ``lags`` (k,) further on [px], row by row.
+    """Sum products of residuals (rows, cols) that are ``lags`` (k,) apart [px], row by row.
 
     Fills ``products`` and ``counts`` (rows, 2, k): sums and numbers of pairs, down the columns and
     along the rows.
@@ -87,7 +87,7 @@ def block_moments(f: Any, residual: Any, size: int, sums: Any, thread: int, thre
 
 
 _SPARED_PX = 3
-"""Closer than that the deformed image's spline correlates its noise most."""
+"""Least lag: below it the deformed image's spline correlates its noise most."""
 LAGS_PX = (4, 6, 8, 10, 12)
 """What :func:`lags_for` gives for the paper's speckle, 12 px wide."""
 BLOCK_PX, CORRELATED = 32, 0.3
@@ -108,12 +108,12 @@ class ResidualTest:
     correlation: float
     """Rms autocorrelation of the residual at ``lags_px`` along rows and columns [-]."""
     pixels: int
-    """In the residual."""
+    """Number of pixels in the residual."""
     chi_square: float = float("nan")
     """Sum of squares of the residual over what the noise predicts; 1 is agreement [-]. NaN where
     the noise is not known."""
     lags_px: tuple[int, ...] = LAGS_PX
-    """Distances at which the residual was compared with itself [px]."""
+    """Lags at which the autocorrelation was taken [px]."""
 
     @classmethod
     def of(
@@ -125,7 +125,7 @@ class ResidualTest:
         unknowns : Number of fitted unknowns.
         noise_sd : Standard deviation of the residual that the images' noise predicts [grey levels],
             if known (:meth:`modeharvest.idic.result.Result.residual_noise`); InputError if not > 0.
-        lags_px : Where the autocorrelation was taken.
+        lags_px : Lags at which the autocorrelation was taken [px].
         """
         if noise_sd is None:
             return cls(correlation, pixels, lags_px=lags_px)
@@ -137,7 +137,7 @@ class ResidualTest:
 
     @property
     def is_white(self) -> bool:
-        """Whether neighbouring pixels' residuals have nothing to do with each other."""
+        """Whether the residual is uncorrelated from pixel to pixel."""
         return bool(self.correlation < _WHITE + _SIGMAS / np.sqrt(max(1, self.pixels)))
 
     @property
@@ -148,7 +148,7 @@ class ResidualTest:
 
     @property
     def text(self) -> str:
-        """What that means."""
+        """The result of the test, in words."""
         known = "" if np.isnan(self.chi_square) else f"chi squared is {self.chi_square:.3g}, and "
         if self.is_white and self.is_predicted:
             return f"The residual is noise: {known}it is uncorrelated ({self.correlation:.3f})."
@@ -165,7 +165,7 @@ class ResidualTest:
 
 
 def lags_for(speckle_size_px: float) -> tuple[int, ...]:
-    """Distances over which a model error shows, and noise doesn't [px].
+    """Lags at which a model error is correlated, and noise isn't [px].
 
     From a third of a speckle (see :func:`modeharvest.idic.solver.final_smoothing.speckle_size`) to
     a whole one, but no closer than what the spline correlates.
@@ -180,8 +180,8 @@ def autocorrelation(
     """Rms autocorrelation of a residual at some lags along rows and columns [-].
 
     The residual is f - g(x + u) (rows, cols), NaN where no pixel counts. ``by_spline``, (2, lags)
-    by :func:`~modeharvest.idic.solver.noise.spline_autocorrelation`, is what that of g's noise
-    alone would be; of it that share is taken out, from 0 to 1, which leaves the least.
+    by :func:`~modeharvest.idic.solver.noise.spline_autocorrelation`, is the autocorrelation of g's
+    noise alone. The share of it, from 0 to 1, that leaves least is subtracted.
     """
     lags = np.array([0, *lags_px])
     sums, counts = (np.zeros((len(residual), 2, len(lags))) for _ in range(2))
@@ -208,7 +208,7 @@ def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> fl
 
     Over blocks of ``BLOCK_PX``: those in which the reference f (rows, cols) and the deformed image
     pulled back to it, f less the residual (NaN where no pixel counts), have a zero-normalised
-    cross-correlation below ``CORRELATED``. At a local minimum a speckle or more off, it is about 0.
+    cross-correlation below ``CORRELATED``: it is about 0 at a local minimum a speckle or more off.
     """
     blocks = [-(-size // BLOCK_PX) for size in residual.shape]
     sums = np.empty((*blocks, 6))

@@ -1,19 +1,19 @@
 """Which gradient weighs the residual (instrumental variables), and the root of h'r = 0.
 
 A correlation ends where h'r = 0: r is the residual f - g(x + u), h are the displacement's
-derivatives times a gradient. With the gradient of g at x + u that is the least-squares minimum.
-But g's noise has a gradient of its own, the noise of the residual among it:
+derivatives times a gradient. With the gradient of g at x + u that is the least-squares minimum. But
+that gradient includes the gradient of g's noise, and the same noise is in the residual:
 
 * the two are correlated by half the slope of the interpolated noise's variance, which depends on
   where between pixels x + u lies: a bias of the displacement, with a period of one pixel;
 * the noise's gradient scatters the unknowns.
 
-These are errors in the variables, for which the cure is an *instrument*, an h whose errors have
-nothing to do with those of r. Whatever h is, exact images have r = 0 at the truth, so that no
-choice of h makes a bias of its own. The gradient of f, pushed forward by F^-T to where it belongs
-in g, is such an instrument: at a pixel of f, its noise and the slope of its noise are
-uncorrelated, because the spline is symmetric about the pixel. A blur of f takes from the slope's
-noise by its fourth power, and costs little as long as it is narrow against a speckle.
+These are errors in the variables. The remedy is an *instrument*, an h whose errors are independent
+of those of r. Whatever h is, exact images have r = 0 at the truth, so that no choice of h causes a
+bias of its own. The gradient of f, pushed forward by F^-T to its place in g, is such an instrument:
+at a pixel of f, its noise and the slope of its noise are uncorrelated, because the spline is
+symmetric about the pixel. A blur of f reduces the slope's noise by its fourth power, and costs
+little as long as it is narrow compared with a speckle.
 
 Sources: J. Neggers, B. Blaysat, J. P. M. Hoefnagels, M. G. D. Geers, Int. J. Numer. Methods Eng.
 105 (2016), doi 10.1002/nme.4971 (the choice of the gradient); W. A. Fuller, Measurement Error
@@ -21,10 +21,10 @@ Models, Wiley 1987, doi 10.1002/9780470316665 (instruments); H. Schreier, M. Sut
 (2002), doi 10.1007/BF02410987, and Y. Wang et al., Strain 45 (2009), doi
 10.1111/j.1475-1305.2008.00592.x (bias by interpolated noise).
 
-Their slopes are taken once, at the least-squares minimum, and from there Newton steps lead to the
-root, which is a few hundredths of a pixel off. There is no cost that has to fall. The derivative
-of h'r is A = h'J, J being that of the residual; noise that perturbs h'r with the covariance s^2 h'h
-moves the root with s^2 A^-1 h'h A^-1.
+The instrument's slopes are taken once, at the least-squares minimum. From there Newton steps lead
+to the root, which is a few hundredths of a pixel off; no cost has to fall. The derivative of h'r is
+A = h'J, J being that of the residual; noise that perturbs h'r with the covariance s^2 h'h moves the
+root with the covariance s^2 A^-1 h'h A^-1.
 """
 
 from __future__ import annotations
@@ -57,25 +57,25 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.scaled_eigen import ScaledEigen
 
 WORTH_IT = 0.01
-"""Share of the unknowns' variance for which a blur is worth having [-]."""
+"""Least reduction of the unknowns' variance for which a blur is taken [-]."""
 ALIASED = 1e-4
-"""Power of the aliased part of a wave over its own where the low-pass filter leaves half [-]: where
-benchmarks/small_motion.py sees neither bias nor much more scatter."""
+"""Power of the aliased part of a wave over its own at which the low-pass filter leaves half [-]:
+with it benchmarks/small_motion.py shows neither bias nor much more scatter."""
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 class Gradient(Enum):
-    """Of which image the gradient is that weighs the residual."""
+    """Image whose gradient weighs the residual."""
 
     DEFORMED = "deformed"
-    """Of g at x + u: the derivative of the cost."""
+    """The gradient of g at x + u: h'r is then the derivative of the cost."""
     REFERENCE = "reference"
-    """Of f at x, pushed forward: F^-T times it, the same in exact images."""
+    """The gradient of f at x, pushed forward by F^-T: the same in exact images."""
 
 
 @dataclass(frozen=True)
 class Weighting:
-    """What weighs the residual."""
+    """What weighs the residual: a gradient, and the filter of its image."""
 
     gradient: Gradient = Gradient.DEFORMED
     blur_px: float = 0.0
@@ -103,8 +103,8 @@ class Weighting:
 
         With the same noise in both images, the reference's gradient, and a speckle whose
         autocorrelation is exp(-r^2/(2 L^2)); t = (s/L)^2 for a blur s. The blur's cost,
-        (1 + t)^4/(1 + 2 t)^2, is that of weights that are not the gradient itself. The half: the
-        noise of an image has nothing in common with its own gradient. ``noise`` is its variance
+        (1 + t)^4/(1 + 2 t)^2, arises because the weights are no longer the gradient itself. The
+        half: the noise of an image is uncorrelated with its own gradient. ``noise`` is its variance
         over the mean square of the speckle's slope [px^2], ``order`` the spline's.
         """
         noise *= slope_noise(order, self.blur_px)
@@ -116,10 +116,10 @@ class Weighting:
     def passed(self, k: NDArray[Any]) -> FloatArray:
         """Share that the low-pass filter leaves of a wave of ``k`` = 0 ... 0.5 cycles/px [-].
 
-        Pixels take the wave 1 - k for k. A speckle whose autocorrelation is exp(-r^2/(2 L^2)) has
-        the power S(k) ~ exp(-(2 pi L k)^2/2), and of that much of a wave, S(1 - k)/S(k), aliasing
-        has a part; half is left where that is :data:`ALIASED`. It would be a bias of the
-        displacement, because residual and weight share it.
+        Pixels alias the wave 1 - k to k. A speckle whose autocorrelation is exp(-r^2/(2 L^2)) has
+        the power S(k) ~ exp(-(2 pi L k)^2/2), so that the share S(1 - k)/S(k) of a wave is aliased;
+        half is left where that is :data:`ALIASED`. Aliasing would bias the displacement, because
+        residual and weight share it.
         """
         k_L = _FWHM / (2.0 * np.pi * self.speckle_size_px)
         aliased = np.exp((k - 0.5) / k_L**2)
@@ -128,7 +128,7 @@ class Weighting:
     def slope_noise(self, order: int) -> float:
         """Variance at a pixel of the slope of white noise of variance 1, filtered so [1/px^2].
 
-        ``order`` is the spline's; after a low-pass filter it is taken for ideal.
+        ``order`` is the spline's; with a low-pass filter the spline is taken for ideal.
         """
         if not self.low_pass:
             return slope_noise(order, self.blur_px)
@@ -138,7 +138,7 @@ class Weighting:
 
     @property
     def text(self) -> str:
-        """That in words."""
+        """The weighting in words."""
         whose = {
             Gradient.DEFORMED: "the deformed image's gradient",
             Gradient.REFERENCE: "the reference's gradient",
@@ -160,7 +160,7 @@ def best_blur(noise: float, size_px: float, order: int = 5) -> float:
     """Blur of the gradient's image for the least variance of the unknowns [px]; 0 for none.
 
     ``noise`` and ``order`` as for :meth:`Weighting.excess`, the speckle's autocorrelation having a
-    full width at half maximum of ``size_px``; a blur has to spare :data:`WORTH_IT` of the variance.
+    full width at half maximum of ``size_px``; a blur must save :data:`WORTH_IT` of the variance.
     """
     candidates = [Weighting(Gradient.REFERENCE, blur, size_px) for blur in (0.0, *_BLURS_PX)]
     excess = [weighting.excess(noise, order) for weighting in candidates]
@@ -169,16 +169,16 @@ def best_blur(noise: float, size_px: float, order: int = 5) -> float:
 
 
 LEAST_BLUR_PX = 0.6
-"""Below that a sampled Gaussian isn't one."""
+"""Least blur: a narrower Gaussian isn't one when it is sampled."""
 _BLURS_PX = tuple(LEAST_BLUR_PX + 0.05 * k for k in range(69))
-"""Up to 4 px."""
+"""Blurs that are tried, up to 4 px."""
 
 _FAR = 10.0
-"""Steps longer than that many times the first one: it runs away."""
+"""Length of a step over the shortest one beyond which the iteration diverges."""
 _REACH_PX = 48
-"""To either side, of the low-pass filter [px]; its weights have fallen to 1 % by then."""
+"""Half the length of the low-pass filter [px]; its weights have fallen to 1 % there."""
 _NEIGHBOURS_PX = 1.0
-"""Blur by which a pixel's neighbours stand for it where a gain is among the unknowns [px]."""
+"""Blur that gives a pixel's neighbours in place of it, if a gain is among the unknowns [px]."""
 
 
 def instrument(
@@ -188,8 +188,8 @@ def instrument(
 
     In the reference's frame, at the pixels ``used``; ``a`` are the unknowns of the least-squares
     minimum, ``level`` is the pair prepared for the finest level. The grey levels, for a gain among
-    the unknowns, are those of f around each pixel without the pixel itself: so their noise has
-    nothing in common with the residual's.
+    the unknowns, are means of f around each pixel without the pixel itself, so that their noise is
+    independent of the residual's.
     """
     order = level.deformed.order
     # As in the pyramid: what is beyond the material is only left out if both masks are known.
@@ -213,7 +213,7 @@ def instrument(
 def _filtered(
     weighting: Weighting, image: NDArray[Any], mask: NDArray[np.bool_] | None
 ) -> NDArray[Any]:
-    """An image over its material, True in the mask, without what its gradient is not to have."""
+    """Filter an image over its material, True in the mask, as the weighting specifies."""
     if not weighting.low_pass:
         return smoothed(image, mask, weighting.blur_px)
     passed = np.asarray(image, np.float32)
@@ -253,7 +253,7 @@ class Propagation:
     def of(cls, matrix: Callable[[float], FloatArray], least_squares: FloatArray) -> Propagation:
         """From matrices of squares alone: for the mean m of h and J, 4 m'm = h'h + J'J + A + A'.
 
-        ``matrix`` makes the (n, n) m'm of weights that are a mixture: so much of h, the rest of J.
+        ``matrix`` makes the (n, n) m'm of mixed weights: a share of h, the rest of J.
         """
         pure, mixed = matrix(1.0), matrix(0.5)
         return cls(2.0 * mixed - 0.5 * (pure + least_squares), pure)
@@ -267,10 +267,10 @@ def root(
     options: GaussNewtonOptions,
     on_iteration: Callable[[int], None] = lambda number: None,
 ) -> Minimum:
-    """Find the root, from a least-squares minimum.
+    """Find the root of h'r = 0, starting from a least-squares minimum.
 
-    Returned with the minimum's own matrix J'J, and these steps alone; converged. If they don't
-    settle, the minimum itself with the outcome UNWEIGHTED.
+    Returns it as converged, with the minimum's own matrix J'J, and these steps alone. If they don't
+    converge, returns the minimum itself with the outcome UNWEIGHTED.
 
     evaluate : -h'r at some unknowns, as the gradient of normal equations.
     curvature : (n, n) A = h'J.

@@ -1,9 +1,9 @@
 """Constraints between the waves of a field: equal amplitudes and phases as one parameter.
 
-Plane waves with complex amplitudes become real ones, A and B sin(π/l (kx x + ky y + c)), and what
-symmetry makes equal among them becomes one parameter. A symmetry that turns one wave vector into
-another turns the motion with it, so amplitudes are compared in each wave's own frame: L along its
-wave vector and T across, (A, B) = L n + T m with n = k/|k| and m = n turned by +90 degrees.
+Plane waves with complex amplitudes become real ones, A and B sin(π/l (kx x + ky y + c)), and
+amplitudes that symmetry makes equal become one parameter. A symmetry that turns one wave vector
+into another turns the motion with it, so amplitudes are compared in each wave's own frame: L along
+its wave vector and T across, (A, B) = L n + T m with n = k/|k| and m = n turned by +90 degrees.
 
 * L and T with a common phase: one wave. Otherwise two waves with the same wave vector, one of L
   and one of T, each with a phase of its own.
@@ -11,8 +11,8 @@ wave vector and T across, (A, B) = L n + T m with n = k/|k| and m = n turned by 
 * L or T zero: fixed at zero.
 * The overall amplitude is fixed, since v_i carries it.
 
-Wave vectors are free, and so are phases: they make up for a specimen that isn't quite its drawing
-(the paper's a₂ ... a₇). The frames stay those of the wave vectors found.
+Wave vectors and phases are free: they compensate differences between a specimen and its drawing
+(the paper's a₂ ... a₇). The frames remain those of the wave vectors found.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from modeharvest.idic.spectra.waves import Selection, common_phase, grouped
 from modeharvest.util.arrays import FloatArray
 
 SAME_AMPLITUDE = 0.02
-"""Difference of two amplitudes that are called equal, or from zero, of the star's strongest: the
-smallest that a correlation would notice; a mesh without symmetry makes less (a test)."""
+"""Difference of two amplitudes that are called equal, or from zero, over the star's strongest: the
+smallest that a correlation would notice; an asymmetric mesh makes less (a test)."""
 IN_PHASE = 0.02
 """Share of a wave that may be out of phase between x and y. A real mode at a wave vector on the
 zone's boundary is in phase to rounding where the cell has an inversion centre."""
@@ -48,9 +48,9 @@ class RealWave:
     phase: float
     """c [l], above −1/2 and up to 1/2; the rest is in the signs."""
     star: int
-    """Which star of waves it belongs to."""
+    """Number of the star of waves that it belongs to."""
     shares_k: bool = False
-    """Whether its wave vector is that of the wave before: one of two that are out of phase."""
+    """Whether it has the wave vector of the wave before: two such waves are out of phase."""
 
     @property
     def frame(self) -> FloatArray:
@@ -69,7 +69,7 @@ class RealWave:
 
     @property
     def polarisation(self) -> str:
-        """How it moves compared with where it points: transverse, longitudinal, or mixed."""
+        """Direction of motion relative to the wave vector: transverse, longitudinal, or mixed."""
         along, across = np.abs(self.amplitude) / self.strength
         if along <= POLARISED:
             return "transverse"
@@ -78,7 +78,7 @@ class RealWave:
 
 @dataclass(frozen=True)
 class Tie:
-    """Amplitudes of one component that are one parameter, or fixed."""
+    """Amplitudes of one component that share one parameter, or are fixed."""
 
     component: int
     """0 for L, along the wave vector, 1 for T, across."""
@@ -94,7 +94,7 @@ class Tie:
 
 
 def real_waves(selection: Selection) -> list[RealWave]:
-    """Turn complex amplitudes into real waves, one each or two."""
+    """Turn complex amplitudes into real waves, one or two for each."""
     waves: list[RealWave] = []
     for xi, cartesian, star in zip(selection.xi, selection.amplitudes, selection.star, strict=True):
         z = local_frame(xi) @ cartesian
@@ -112,7 +112,7 @@ def real_waves(selection: Selection) -> list[RealWave]:
 def _real_wave(
     xi: FloatArray, amplitude: FloatArray, angle: float, star: int, shares_k: bool = False
 ) -> RealWave:
-    """Move the phase between −1/2 and 1/2 l; what rounding makes of 0 and 1/2 is the same."""
+    """Move the phase to between −1/2 and 1/2 l; 0 and 1/2 stay themselves in spite of rounding."""
     phase = round(angle / np.pi, 12)
     turns = np.ceil(phase - 0.5 - 1e-9)
     along, across = amplitude * (-1.0) ** turns
@@ -121,7 +121,7 @@ def _real_wave(
 
 
 def find_ties(waves: list[RealWave]) -> list[Tie]:
-    """Amplitudes that are equal within a star, or zero: T before L, strongest star first."""
+    """Find amplitudes that are equal within a star, or zero: T before L, strongest star first."""
     ties = []
     for star in dict.fromkeys(w.star for w in waves):
         members = [k for k, w in enumerate(waves) if w.star == star]
@@ -142,7 +142,7 @@ def _clustered(component: int, sizes: dict[int, float], tolerance: float) -> lis
 
 
 def fixed_tie(ties: list[Tie]) -> Tie:
-    """The amplitudes that are fixed at ±1: the largest."""
+    """The amplitudes that are fixed at ±1: the largest ones."""
     return max(ties, key=lambda tie: tie.value)
 
 
@@ -167,7 +167,7 @@ def tied_family(waves: list[RealWave], ties: list[Tie], pitch: float) -> ModeFam
 
 
 def _amplitude_column(tie: Tie, waves: list[RealWave]) -> FloatArray:
-    """(5 w,) What a unit of the tied amplitude is, as A and B of each wave, signs included."""
+    """(5 w,) A and B of each wave for a unit of the tied amplitude, signs included."""
     column = np.zeros((len(waves), PER_WAVE))
     for w in tie.waves:
         sign = np.sign(waves[w].amplitude[tie.component])
@@ -182,7 +182,7 @@ def describe(
     family: ModeFamily,
     captured: float,
 ) -> tuple[str, ...]:
-    """Which waves, what they have in common, and how much of the field they are."""
+    """Describe the waves, what they have in common, and their share of the field, in words."""
     energy = f"At the start they are {100 * captured:.1f} % of the energy over the material; "
     if selection.growth[-1][0] == len(selection.xi):
         energy += "no further wave could be distinguished from them."
@@ -193,7 +193,7 @@ def describe(
 
 
 def number(count: int, noun: str) -> str:
-    """Such as "two waves"."""
+    """Write a count and a noun, such as "two waves"."""
     word = _NUMBERS[count] if count < len(_NUMBERS) else str(count)
     return f"{word} {noun}{'s' * (count != 1)}"
 

@@ -5,13 +5,13 @@ With l the pitch, A the area of the cell (holes included) and u zero in the hole
     û(ξ) = ∫_cell u(x) exp(−2πi ξ·x/l) dA   [mm³]      S_xx = |û_x|², S_yy = |û_y|²   [mm⁶]
 
 A periodic field has energy at the reciprocal vectors of its cell only, ξ = l (n1 b1 + n2 b2) with
-b_i·a_j = δ_ij; between them a lattice of many cells has nothing. Parseval's theorem reads
-Σ (S_xx + S_yy) = A ∫ |u|² dA. For u without a unit (a mode), take "mm" off once.
+b_i·a_j = δ_ij; a lattice of many cells has none between them. Parseval's theorem reads
+Σ (S_xx + S_yy) = A ∫ |u|² dA. For u without a unit (a mode), one "mm" less.
 
 This is :mod:`modeharvest.idic.spectra.spectrum` for fields of which one period is known.
 
-Every element is integrated by a product of Gauss rules; on triangles one side of the square is
-collapsed into a corner, with the Gauss-Jacobi rule whose weight is the Jacobian of doing so
+Every element is integrated by a product of Gauss rules. On triangles, one side of the square is
+collapsed into a corner, with the Gauss-Jacobi rule whose weight is the Jacobian of that map
 (A. H. Stroud, Approximate Calculation of Multiple Integrals, 1971).
 """
 
@@ -36,11 +36,11 @@ class MeshQuadrature:
 
     A wave whose phase turns by p rad across the largest element is integrated to 1e-10 by 4 + p
     points per direction and element, see :func:`points_for`. Raises InputError if an element is
-    turned inside out.
+    inverted.
 
     positions : (q, 2) points in the material [mm].
-    weights : (q,) area that each stands for [mm^2], positive.
-    area : of the material [mm^2].
+    weights : (q,) area that each represents [mm^2], positive.
+    area : area of the material [mm^2].
     """
 
     def __init__(self, mesh: Mesh, points: int = 8) -> None:
@@ -61,13 +61,13 @@ class MeshQuadrature:
         self.area = float(self.weights.sum())
 
     def values(self, nodal: ArrayLike) -> FloatArray:
-        """(q, c) values, at the points, of a field (n, c) given at the mesh's nodes."""
+        """(q, c) values, at the quadrature points, of a field (n, c) given at the mesh's nodes."""
         field = np.asarray(nodal, dtype=np.float64)
         at_points = np.einsum("pk,mkc->mpc", self._shapes, field[self.mesh.cells], optimize=True)
         return np.ascontiguousarray(at_points.reshape(-1, field.shape[1]))
 
     def without_mean(self, values: FloatArray) -> FloatArray:
-        """Values (q, c) less their mean over the material: rigid translations taken out."""
+        """Values (q, c) less their mean over the material, which removes rigid translations."""
         return np.asarray(values - self.weights @ values / self.area)
 
     def product(self, first: FloatArray, second: FloatArray) -> float:
@@ -76,7 +76,7 @@ class MeshQuadrature:
 
 
 def points_for(mesh: Mesh, wave_number: float) -> int:
-    """Points per direction for waves up to a wave number [rad/mm], to about 1e-10."""
+    """Quadrature points per direction for waves up to a wave number [rad/mm], to about 1e-10."""
     corners = mesh.nodes[mesh.cells[:, : 3 if mesh.element.startswith("T") else 4]]
     size = float(np.ptp(corners, axis=1).max())
     return 4 + int(np.ceil(wave_number * size))
@@ -85,9 +85,9 @@ def points_for(mesh: Mesh, wave_number: float) -> int:
 def gauss_rule(triangular: bool, points: int) -> tuple[FloatArray, FloatArray]:
     """Local points (p, 2) and weights (p,) on the reference triangle or square.
 
-    The triangle is xi, eta >= 0, xi + eta <= 1, the square goes from -1 to 1. ``points`` are those
-    per direction: p is its square, and polynomials up to the degree 2 ``points`` - 1 (on the square
-    in each coordinate) are integrated exactly.
+    The triangle is xi, eta >= 0, xi + eta <= 1, the square goes from -1 to 1. ``points`` is the
+    number per direction: p is its square, and polynomials up to the degree 2 ``points`` - 1 (on the
+    square in each coordinate) are integrated exactly.
     """
     s, ws = np.polynomial.legendre.leggauss(points)
     if not triangular:
@@ -101,13 +101,13 @@ def gauss_rule(triangular: bool, points: int) -> tuple[FloatArray, FloatArray]:
 
 
 PERIODIC = 1e-4
-"""Largest difference of a field between partner nodes, of its largest value: far above what
-single precision leaves, far below what an affine part does."""
+"""Largest difference of a field between partner nodes, over its largest value: far above rounding
+in single precision, far below the effect of an affine part."""
 PARTNERS = 1e-4
 """Distance, in lattice vectors, up to which nodes are partners; elements are far larger."""
 LEAST_SHARE = 1e-6
-"""Least share of the energy of what is listed as a peak: below, symmetry forbids the wave and
-the number is the mesh's."""
+"""Least share of the energy of a wave that is listed as a peak: below it, symmetry forbids the wave
+and the number is an error of the mesh."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class LatticePeak:
     """A wave vector of a periodic field and its mirror image −ξ."""
 
     xi: tuple[float, float]
-    """(ξ1, ξ2) Cartesian [1/l], of the two the one with ξ2 > 0, or ξ1 > 0 on the axis."""
+    """(ξ1, ξ2) Cartesian [1/l]: of ξ and −ξ the one with ξ2 > 0, or ξ1 > 0 on the axis."""
     density: float
     """S_xx + S_yy [mm⁶]."""
     share: float
@@ -135,11 +135,11 @@ class LatticeSpectrum:
     lattice: FloatArray
     """(2, 2) vectors of the cell as rows [mm]."""
     energy: float
-    """∫ |u|² dA over the material of the cell, translation taken out [mm⁴]."""
+    """∫ |u|² dA over the material of the cell, without the translation [mm⁴]."""
     material: float
     """Area of the material of the cell [mm²]."""
     translation: tuple[float, float]
-    """(2,) mean over the material that was taken out [mm]."""
+    """(2,) mean of the field over the material, which was subtracted [mm]."""
 
     @property
     def density(self) -> FloatArray:
@@ -154,7 +154,7 @@ class LatticeSpectrum:
 
     @property
     def peaks(self) -> tuple[LatticePeak, ...]:
-        """Wave vectors that carry energy, one of each pair ± ξ, by density, largest first."""
+        """Wave vectors that carry energy, one of each pair ±ξ, by density, the largest first."""
         density, shares = self.density.sum(axis=1), self.shares
         listed = np.flatnonzero(upward(self.xi) & (2.0 * shares >= LEAST_SHARE))
         order = listed[np.argsort(-density[listed], kind="stable")]
@@ -172,7 +172,7 @@ def lattice_spectrum(
     nothing but a translation; if the mesh is larger than the cell; if pitch or reach aren't
     positive.
 
-    mesh : One cell of the lattice, of any boundary that tiles the plane [mm].
+    mesh : One cell of the lattice, of any shape that tiles the plane [mm].
     lattice : (2, 2) lattice vectors as rows [mm]; they need not be at right angles.
     values : (n, 2) field at the nodes, periodic: the affine part is already removed [mm].
     pitch : l [mm], which makes the wave vectors dimensionless.
@@ -214,7 +214,7 @@ def reciprocal_vectors(lattice: FloatArray, pitch: float, reach: float) -> Float
 
 
 def upward(xi: FloatArray) -> NDArray[np.bool_]:
-    """(n,) True for one of each ± ξ: that with ξ2 > 0, or ξ1 > 0 on the axis; False for 0."""
+    """(n,) True for one of each ±ξ: the one with ξ2 > 0, or ξ1 > 0 on the axis; False for 0."""
     on_axis = np.abs(xi[:, 1]) < 1e-9
     return np.asarray(np.where(on_axis, xi[:, 0] > 1e-9, xi[:, 1] > 0))
 
@@ -222,7 +222,7 @@ def upward(xi: FloatArray) -> NDArray[np.bool_]:
 def _checked_field(
     mesh: Mesh, lattice: ArrayLike, values: ArrayLike, pitch: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Field (n, 2) and lattice (2, 2) as arrays, or an InputError."""
+    """Return field (n, 2) and lattice (2, 2) as arrays, or raise InputError."""
     u, vectors = np.asarray(values, dtype=np.float64), lattice_vectors(lattice, "periodic field")
     if u.shape != mesh.nodes.shape:
         raise InputError(f"periodic field: expected shape {mesh.nodes.shape}, got {u.shape}")
@@ -235,7 +235,7 @@ def _checked_field(
 
 
 def _check_periodic(mesh: Mesh, lattice: FloatArray, u: FloatArray) -> None:
-    """Raise InputError where partner nodes differ in the field, or there are no partners."""
+    """Raise InputError where the field differs at partner nodes, or if there are no partners."""
     fractional = np.mod(np.mod(mesh.nodes @ np.linalg.inv(lattice), 1.0), 1.0)
     pairs = cKDTree(fractional, boxsize=1.0).query_pairs(PARTNERS, output_type="ndarray")
     distance = np.linalg.norm(np.diff(mesh.nodes[pairs], axis=1)[:, 0], axis=1)
@@ -254,7 +254,7 @@ def _check_periodic(mesh: Mesh, lattice: FloatArray, u: FloatArray) -> None:
 
 
 def _check_energy(energy: float, whole: float, rule: MeshQuadrature, lattice: FloatArray) -> None:
-    """Raise InputError for a field that only translates, or a mesh that is more than a cell."""
+    """Raise InputError for a field that only translates, or a mesh that is larger than a cell."""
     cell = abs(float(np.linalg.det(lattice)))
     if rule.area > cell * (1.0 + 1e-6):
         raise InputError(

@@ -1,16 +1,16 @@
 """Mode families found in periodic fields: identification, overlap with nodal fields, JSON files.
 
-What the paper does by eye in its Section "Parametrization and Initial Guess of the Patterning
-Modes": find the peaks, take the waves that matter (``waves``), see what they have in common
-(``constraints``), and describe it. For the (π, π) mode of a square lattice this is Eq. (mode)
-with its seven parameters.
+Automates what the paper does by eye in its Section "Parametrization and Initial Guess of the
+Patterning Modes": find the peaks, take the waves that matter (``waves``), see what they have in
+common (``constraints``), and describe them. For the (π, π) mode of a square lattice this is Eq.
+(mode) with its seven parameters.
 
 The normalised overlap |∫ u·φ dA| / (‖u‖ ‖φ‖) is 1 for fields that differ by a factor. Both are
-taken without their mean over the material: a rigid translation is no part of a mode.
+taken without their mean over the material: a rigid translation isn't part of a mode.
 
-Programs that don't know this project can read it: a field is ``amplitude`` times the sum over the
-waves of (A, B) sin(π/l (kx x + ky y + c)), [mm]; parameters a give the waves as rows of
-``matrix`` a + ``offset``. Numbers are written so that reading gives the very same ones.
+Programs that don't know this project can read the file: a field is ``amplitude`` times the sum over
+the waves of (A, B) sin(π/l (kx x + ky y + c)), [mm]; parameters a give the waves as rows of
+``matrix`` a + ``offset``. Numbers are written so that reading returns them exactly.
 """
 
 from __future__ import annotations
@@ -79,12 +79,12 @@ def wave_sum(waves: FloatArray, positions: FloatArray, pitch: float) -> FloatArr
 
 
 def wave_values(rule: MeshQuadrature, waves: FloatArray, pitch: float) -> FloatArray:
-    """(q, 2) the same at the points of a quadrature, without mean."""
+    """(q, 2) sum of waves at the points of a quadrature, without its mean."""
     return rule.without_mean(wave_sum(waves, rule.positions, pitch))
 
 
 def best_amplitude(rule: MeshQuadrature, u: FloatArray, phi: FloatArray) -> tuple[float, float]:
-    """Factor a that makes a φ nearest to u, and the share of ∫ |u|² that a φ is.
+    """Factor a that makes a φ nearest to u, and the share of ∫ |u|² that a φ describes.
 
     The share is the square of the normalised overlap. Raises InputError if one of the two is zero.
     """
@@ -95,13 +95,13 @@ def best_amplitude(rule: MeshQuadrature, u: FloatArray, phi: FloatArray) -> tupl
 
 
 NEAR_DIAGONAL = 0.1
-"""Difference of a wave vector's components from ±1 [π/l] up to which it is called diagonal: the
+"""Difference of a wave vector's components from ±1 [π/l] up to which it counts as diagonal: the
 next reciprocal vectors of even a 10 x 10 cell are 0.2 away."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundFamily:
-    """A mode family, where it came from, and how much of the field it is.
+    """A mode family, its origin, and the share of the field that it describes.
 
     The field is about ``amplitude`` times the sum of the family's waves at its start.
     """
@@ -110,11 +110,11 @@ class FoundFamily:
     pitch: float
     """l [mm], the half-wavelength of :class:`modeharvest.idic.modes.FourierMode`."""
     amplitude: float
-    """[unit of the field], with sign."""
+    """Factor of the family's waves, with sign [unit of the field]."""
     captured: float
     """Share of ∫ |u|² over the material, translation apart, that amplitude and start describe."""
     growth: tuple[tuple[int, float], ...]
-    """(number of waves, share captured by as many, nothing tied); goes on beyond those taken."""
+    """(number of waves, share described by so many, nothing tied); continues beyond those taken."""
     text: tuple[str, ...]
     info: Mapping[str, Any] = field(default_factory=dict)
     """Plain JSON values of the caller: lattice, material, loading, critical strain."""
@@ -143,7 +143,7 @@ def mode_family(
     shared : Look for constraints; otherwise every wave has five parameters of its own (but one).
     growth : Least share of the energy that a further star of waves must add [-]; larger for fewer
         waves.
-    info : To keep with the family.
+    info : Plain JSON values to keep with the family.
     """
     spectrum = lattice_spectrum(mesh, lattice, values, pitch)
     rule = MeshQuadrature(mesh, points_for(mesh, 6.0 * np.pi / pitch))
@@ -164,10 +164,10 @@ def mode_family(
 
 
 def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
-    """The paper's Eq. (mode) with these waves (w, 5) as its start, if it has them; else None.
+    """Make the paper's Eq. (mode) with these waves (w, 5) as its start if they fit it; else None.
 
-    Two waves near the two diagonals, |A| equal, |B| equal, and signs the same in one component and
-    opposite in the other. The origin is at a junction or at a hole's centre, whichever is nearer.
+    They fit if they are two near the two diagonals, |A| equal, |B| equal, and signs the same in one
+    component and opposite in the other. The origin is at a junction or a hole, whichever is nearer.
     """
     if len(waves) != 2:
         return None
@@ -203,7 +203,7 @@ def write_family(
     """Write a family as JSON, atomically.
 
     ``info`` are plain JSON values to add to the family's own, such as the critical strain; a
-    spectrum of the same field is kept beside it. Raises InputError if ``info`` can't be written as
+    spectrum of the same field is stored with it. Raises InputError if ``info`` can't be written as
     JSON, or the file can't be written.
     """
     plain = to_plain(found)
@@ -229,7 +229,7 @@ def write_family(
 
 
 def read_family(path: Path | str) -> FoundFamily:
-    """Read what :func:`write_family` wrote; InputError if it is damaged or something else."""
+    """Read what :func:`write_family` wrote; InputError if it is damaged or another kind of file."""
     with reading(path, _WHAT):
         content = read_record(path, FORMAT, _WHAT, "make it again")
         return FoundFamily(

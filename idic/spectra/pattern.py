@@ -5,9 +5,9 @@ The square family of modes is (Eq. (mode) of the paper), with θᵢ the argument
     φ = a₁ [−sin θ₁ − sin θ₂] e_x + [sin θ₁ − sin θ₂] e_y
     θ₁ = π/l (a₂ x + a₃ y + a₆)        θ₂ = π/l (a₄ x + a₅ y + a₇)
 
-Only the product v₁φ is observable, and these changes don't change it:
+Only the product v₁φ is observable, and the following changes leave it as it is:
 
-* turning a wave round: (k, c) → (−k, l − c), because sin(π − θ) = sin θ;
+* reversing a wave: (k, c) → (−k, l − c), because sin(π − θ) = sin θ;
 * shifting a phase c by a multiple of 2l;
 * swapping the two waves, with a₁ → −a₁ and v₁ → −v₁: φ_y changes sign by the swap, φ_x by a₁;
 * shifting both phases by l, with v₁ → −v₁.
@@ -39,8 +39,8 @@ def mode_equivalent(
 ) -> tuple[FloatArray, int]:
     """Find the equivalent parameters (7,) nearest to a given mode, a₁ … a₅ [-], a₆ and a₇ [mm].
 
-    Distance is Euclidean, with the phases in units of the pitch l [mm]. The sign is what v₁ takes
-    so that v₁φ stays the same field.
+    Distance is Euclidean, with the phases in units of the pitch l [mm]. The sign is the factor of
+    v₁ that keeps the field v₁φ the same.
     """
     target = _checked(nearest_to)
     scale = np.array([1, 1, 1, 1, 1, 1 / pitch, 1 / pitch])
@@ -58,7 +58,7 @@ def mode_deviation(
 ) -> FloatArray:
     """(7,) deviation of a mode from the expected one [%], equivalents resolved.
 
-    Of a₁ … a₅ in % of 1, of the phases a₆ and a₇ in % of l.
+    For a₁ … a₅ in % of 1, for the phases a₆ and a₇ in % of l.
     """
     nearest, _ = mode_equivalent(mode, pitch, expected)
     difference = nearest - _checked(expected)
@@ -67,7 +67,7 @@ def mode_deviation(
 
 
 def nearest_origin(mode: ArrayLike, pitch: float) -> ModeFamily:
-    """Eq. (mode) with the start that is a given mode, its origin where the phases are smaller."""
+    """Make Eq. (mode) with a given mode as its start, at the origin where phases are smaller."""
     found = []
     for origin in ("junction", "hole"):
         family = square_family(origin)
@@ -79,9 +79,9 @@ def nearest_origin(mode: ArrayLike, pitch: float) -> ModeFamily:
 
 
 def square_parameters(waves: FloatArray, pitch: float) -> tuple[FloatArray, float]:
-    """Eq. (mode)'s seven parameters and v₁ that two waves (2, 5) are nearest to.
+    """Find the seven parameters of Eq. (mode) and v₁ that are nearest to two waves (2, 5).
 
-    It has the signs (−a₁, 1) and (−a₁, −1); waves with others are moved by half their length.
+    Eq. (mode) has the signs (−a₁, 1) and (−a₁, −1); other waves are moved by half their length.
     """
     waves = waves.copy()
     turned = np.sign(waves[:, 1]) != (1, -1)
@@ -93,7 +93,7 @@ def square_parameters(waves: FloatArray, pitch: float) -> tuple[FloatArray, floa
 
 
 def _equivalents(a: FloatArray, pitch: float) -> Iterator[tuple[FloatArray, int]]:
-    """Go through the 16 equivalents, phases not wrapped."""
+    """Generate the 16 equivalents, phases not wrapped."""
     for swap, both, turn1, turn2 in product((False, True), repeat=4):
         sign = 1
         ratio, k1, k2, c1, c2 = a[0], a[1:3], a[3:5], a[5], a[6]
@@ -122,20 +122,20 @@ SECONDARY_PEAK = 0.05
 as strong has a quarter; the holes take more away from a wave that changes sign from cell to cell,
 if they lie where it is largest."""
 MOST_PEAKS = 8
-"""No more peaks than this are looked at."""
+"""Most peaks that are considered."""
 MOST_WAVES = 4
-"""No more waves than this are fitted."""
+"""Most waves that are fitted."""
 GROWTH = 0.05
 """A further wave belongs to the pattern if it describes this much more of the field than those
-before; a peak that is there only because the holes repeat another wave describes nothing more."""
+before; a peak that exists only because the holes repeat another wave describes nothing more."""
 SMALLEST_AMPLITUDE = 0.005
 """Mean amplitude of the strongest wave [l] below which there is no pattern."""
 SMALLEST_CONTRAST = 100.0
-"""Ratio of a peak to the median density of the wave vectors searched that makes it a pattern's."""
+"""Least ratio of a pattern's peak to the median density of the wave vectors searched."""
 LARGE_SHARE = 0.25
-"""Share of the field that waves describe, which makes them a pattern, too. A few cells have peaks
-so wide that they are most of what is searched, and no contrast: on the paper's specimen 4 x 4 cells
-have 1.2 after buckling, but a share of 0.98; before buckling it is below 0.01 everywhere."""
+"""Share of the field above which the waves that describe it are a pattern, too. With few cells,
+peaks fill most of what is searched, and have no contrast: on the paper's specimen 4 x 4 cells have
+1.2 after buckling, but a share of 0.98; before buckling it is below 0.01 everywhere."""
 SAME_AMPLITUDE = 1.25
 """Largest ratio of two amplitudes that are called equal."""
 IN_PHASE = 0.2
@@ -151,7 +151,7 @@ class WavePattern:
     """The pattern found in a spectrum."""
 
     waves: tuple[PlaneWave, ...]
-    """Those of the pattern, from right to left by direction; empty if there is none."""
+    """Waves of the pattern, from right to left by direction; empty if there is none."""
     largest: Peak | None
     """The largest peak outside the edges' lines, pattern or not; None if there is no maximum."""
     text: tuple[str, ...]
@@ -159,15 +159,15 @@ class WavePattern:
     """(7,) start for the mode [-, and mm for a₆, a₇], equivalents resolved; None if the family is
     not the square one."""
     start_amplitude: float = 0.0
-    """Amplitude to start v₁φ₁ with: mean amplitude of the waves' y components, with the sign that
+    """Initial amplitude of v₁φ₁: mean amplitude of the waves' y components, with the sign that
     belongs to ``start`` [mm]."""
 
     @property
     def family(self) -> str:
         """Either "square, 7 parameters", if Eq. (mode) describes it, "unknown", or "none".
 
-        Of the square one are two waves near the diagonals, of equal amplitudes in x and in y, and
-        with the same sign in x and the opposite in y (or the reverse).
+        The square family consists of two waves near the diagonals, of equal amplitudes in x and in
+        y, with the same sign in x and opposite signs in y (or the reverse).
         """
         if self.start is not None:
             return SQUARE
@@ -212,7 +212,7 @@ def _pursued(spectrum: Spectrum, peaks: list[Peak]) -> list[Peak]:
 
 
 def _described(waves: tuple[PlaneWave, ...], largest: Peak, pitch: float) -> WavePattern:
-    """Check the observations behind Eq. (mode), one line each."""
+    """Check the properties that Eq. (mode) assumes, with one line of text each."""
     vectors = " and ".join(f"[{w.k[0]:+.3f}, {w.k[1]:+.3f}]" for w in waves)
     count = {1: "One wave", 2: "Two waves"}.get(len(waves), f"{len(waves)} waves")
     text = [f"{count}, {vectors} π/l; the largest peak is {largest.contrast:.0f} times the median."]

@@ -1,6 +1,6 @@
 """Energy spectral densities of displacement fields, known at pixels or measured at points.
 
-The paper reads the family of the mode off S_xx and S_yy by eye; ``pattern`` reads it by program.
+The paper reads the family of the mode off S_xx and S_yy by eye; ``pattern`` does so automatically.
 Transform and wave vectors, with l the unit cell size::
 
     û(ξ) = ∫ u(x) exp(−2πi ξ·x/l) dA   [mm³]      S_xx = |û_x|², S_yy = |û_y|²   [mm⁶]
@@ -8,8 +8,8 @@ Transform and wave vectors, with l the unit cell size::
 where u is the displacement without its affine part, and zero where there is no material. A wave of
 wavelength λ peaks at |ξ| = l/λ: the square pattern at ξ = (±1/2, ±1/2).
 
-The points of a subset DIC lie on a regular grid with gaps, at holes and where subsets failed; they
-take the place of pixels, and gaps that of holes. Scattered points are interpolated to such a grid.
+The points of a subset DIC lie on a regular grid with gaps, at holes and where subsets failed. They
+are treated like pixels, and gaps like holes. Scattered points are interpolated to such a grid.
 
 Source: M. Grigoriu, Stochastic Calculus (2002), and the paper's Section "Parametrization and
 Initial Guess of the Patterning Modes".
@@ -48,11 +48,11 @@ class Spectrum:
     y: FloatArray
     """(p,), (q,) centres of the bins, both ascending [mm]."""
     source: FloatArray
-    """(q, p, 2) what was transformed: bin averages of the displacement [mm], zeros included."""
+    """(q, p, 2) what was transformed: bin averages of the displacement [mm], 0 without material."""
     coverage: FloatArray
     """(q, p) share of each bin that is material [-]."""
     affine: FloatArray
-    """(2, 3) removed part, u_i = affine[i] · (1, x, y): [mm], [-], [-]."""
+    """(2, 3) affine part that was removed, u_i = affine[i] · (1, x, y): [mm], [-], [-]."""
     extent: tuple[float, float]
     """(2,) width and height of the material's bounding box [mm]."""
 
@@ -75,13 +75,13 @@ class Spectrum:
         of = np.asarray(xi, dtype=np.float64)
         x, y = 2 * np.pi / self.pitch * of.reshape(-1, 2).T[..., None]
         flat, shape = values.reshape(len(values), -1), values.shape[1:]
-        # numpy would turn all values into complex ones.
+        # numpy would convert all values to complex ones.
         up = np.cos(y * self.y) @ flat + 1j * (np.sin(y * self.y) @ flat)
         found = np.einsum("kp,kpn->kn", np.exp(1j * x * self.x), up.reshape(-1, *shape))
         return np.asarray(found.reshape(*of.shape[:-1], -1))
 
     def window(self, xi_max: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(ξ1, ξ2, density), both components of ξ within ± ``xi_max`` [1/l]."""
+        """(ξ1, ξ2, density) for both components of ξ within ± ``xi_max`` [1/l]."""
         cols, rows = np.abs(self.xi1) <= xi_max, np.abs(self.xi2) <= xi_max
         return self.xi1[cols], self.xi2[rows], _squared(self.u_hat[np.ix_(rows, cols)])
 
@@ -138,7 +138,7 @@ def _transform(
 
 
 def _affine(u: FloatArray, mask: BoolArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """(3,) least-squares fit of 1, x, y to a component over the material; it is zero outside."""
+    """(3,) least-squares fit of 1, x, y to a component that is 0 outside the material."""
     per_col, per_row = mask.sum(axis=0), mask.sum(axis=1)
     xy = float(y @ (mask @ x))
     n, sx, sy = per_col.sum(), per_col @ x, per_row @ y
@@ -151,7 +151,7 @@ def _affine(u: FloatArray, mask: BoolArray, x: FloatArray, y: FloatArray) -> Flo
 
 
 def _binned(u: FloatArray, factor: int) -> FloatArray:
-    """Averages of (rows, cols) over blocks, incomplete ones filled with zeros."""
+    """Averages of (rows, cols) over blocks, incomplete blocks filled with zeros."""
     rows, cols = (-(-size // factor) for size in u.shape)
     padded = np.zeros((rows * factor, cols * factor))
     padded[: u.shape[0], : u.shape[1]] = u
@@ -177,19 +177,19 @@ def _check(displacement: FloatArray, grid: PixelGrid, mask: BoolArray, pitch: fl
 
 
 ON_GRID = 0.1
-"""Distance [steps] from a regular grid's points up to which points are taken to lie on them; it
-moves a wave of 10 steps by 6 % of its amplitude at most, at random."""
+"""Distance [steps] from a regular grid's points up to which points count as lying on them; this
+changes a wave of 10 steps by 6 % of its amplitude at most, at random."""
 FEWEST_A_CELL = 6
-"""Points along a unit cell: fewer can't distinguish waves of a cell's length from longer ones."""
+"""Fewest points along a unit cell: fewer can't distinguish waves of its length from longer ones."""
 MOST_POINTS = 4e7
-"""Of the regular grid: more, and a stray point far away is the likelier reason."""
+"""Most points of the regular grid: with more, a stray point far away is the likelier reason."""
 
 
 def measured_spectrum(field: LocalField, pitch: float, region: Box | None = None) -> Spectrum:
-    """Transform a displacement field measured at points; those that are not valid count as gaps.
+    """Transform a displacement field measured at points; points that aren't valid count as gaps.
 
-    With a region only the points in this box, for parts of a specimen with patterns of their own,
-    and the affine part over it alone; ``pitch`` is l [mm]. Raises InputError if no valid point is
+    With a region only points in this box are used, for parts of a specimen with their own patterns,
+    and the affine part over it; ``pitch`` is l [mm]. Raises InputError if no valid point is
     in the region, or the points are too sparse for the unit cell.
     """
     if region is not None:
@@ -209,9 +209,9 @@ def measured_spectrum(field: LocalField, pitch: float, region: Box | None = None
 def gridded(field: LocalField) -> tuple[FloatArray, PixelGrid, BoolArray]:
     """Put a field on a regular grid of its own spacing.
 
-    (rows, cols, 2) displacements [mm], 0 in gaps; the grid, whose "pixels" are the points; and
-    (rows, cols) True where there is a point. Raises InputError if the points spread over far more
-    than they fill.
+    Returns (rows, cols, 2) displacements [mm], 0 in gaps; the grid, whose "pixels" are the points;
+    and (rows, cols) True where there is a point. Raises InputError if the points spread over far
+    more than they fill.
     """
     x, y, u = field.valid_points()
     step = field.spacing
@@ -223,7 +223,7 @@ def gridded(field: LocalField) -> tuple[FloatArray, PixelGrid, BoolArray]:
             f"local field {field.source}: expected points that fill their box, got {len(x)} points "
             f"{step:.3g} mm apart over {np.ptp(x):.3g} x {np.ptp(y):.3g} mm; remove stray points"
         )
-    # Over the whole field's length the step is known better than from two neighbours.
+    # The whole field's length gives the step more precisely than two neighbours do.
     step = float((np.ptp(x) + np.ptp(y)) / steps.sum())
     cols, rows = (int(n) + 1 for n in steps)
     grid = PixelGrid(rows, cols, step, float(x.min()), float(y.max()))
@@ -240,7 +240,7 @@ def gridded(field: LocalField) -> tuple[FloatArray, PixelGrid, BoolArray]:
 def _interpolated(
     points: FloatArray, u: FloatArray, grid: PixelGrid
 ) -> tuple[FloatArray, PixelGrid, BoolArray]:
-    """Between scattered points (row, col), linearly; a gap where none is within a step."""
+    """Interpolate linearly between scattered points (row, col); gap where none is within a step."""
     at = np.indices(grid.shape).reshape(2, -1).T
     value = LinearNDInterpolator(points, u, fill_value=0.0)(at).reshape(*grid.shape, 2)
     mask = (cKDTree(points).query(at)[0] <= 1.0).reshape(grid.shape)

@@ -1,25 +1,25 @@
 """Plane waves in displacement fields: spectral peaks, their selection, and least-squares fits.
 
-Of a field known at pixels: peaks are looked for away from the lines that the specimen's edges
-cause. The jump of the mean deformation at a vertical edge spreads energy along ξ2 = 0, at a
-horizontal edge along ξ1 = 0, about l/L wide, L being the material's height or width; and as the
-holes repeat with the period l, copies of the lines stand at whole numbers of ξ1 and ξ2. Wave
-vectors within two such widths (``EDGE_LINE_WIDTHS``) of a whole number in either component are
-left out, unless they stand out against the line itself, which falls off slowly along its length,
-where a wave is a peak (one of the three waves of a hexagonal lattice lies on such a line).
+In a field known at pixels, peaks are searched away from the lines that the specimen's edges cause.
+The jump of the mean deformation at a vertical edge spreads energy along ξ2 = 0, at a horizontal
+edge along ξ1 = 0, about l/L wide, L being the material's height or width. As the holes repeat with
+the period l, copies of the lines lie at whole numbers of ξ1 and ξ2. Wave vectors within two such
+widths (``EDGE_LINE_WIDTHS``) of a whole number in either component are left out, unless they stand
+out against the line. A line decreases slowly along its length, where a wave is a peak (one of the
+three waves of a hexagonal lattice lies on such a line).
 
-A peak is where a wave is. Its amplitude and phase can't be taken from û alone, because the
-holes couple waves whose vectors differ by whole numbers of 1/l, and the diagonals of the
-square pattern do: a third of one shows up at the other. So all waves are fitted at once, by
-least squares over the material, under a Hann taper that keeps the edges out.
+A wave makes a peak. Its amplitude and phase can't be taken from û alone, because the holes couple
+waves whose vectors differ by whole numbers of 1/l, as the diagonals of the square pattern do: a
+third of one appears at the other. Therefore all waves are fitted at once, by least squares over the
+material, under a Hann taper that excludes the edges.
 
-Of a periodic field on a mesh: the spectral density shows where waves may be, not how large they
-are: the holes couple waves that differ by a vector of the lattice of holes, so a wave shows up at
-each of those (see above). What counts is how much of the field's energy over the material the
+In a periodic field on a mesh, the spectral density shows where waves may be, not how large they
+are: the holes couple waves that differ by a vector of the reciprocal lattice, so a wave appears at
+each of those (see above). What counts is the share of the field's energy over the material that the
 waves explain together, by least squares.
 
 Waves are added as stars: peaks of equal density and wavelength, which a symmetry of the field may
-turn into each other, stay together. The first star is that of the largest peak; from then on the
+map to each other, stay together. The first star is that of the largest peak; after it, the
 star that explains most of the rest is next (orthogonal matching pursuit, Pati, Rezaiifar &
 Krishnaprasad, 1993, doi 10.1109/ACSSC.1993.342465).
 """
@@ -43,9 +43,9 @@ T = TypeVar("T")
 EDGE_LINE_WIDTHS = 2.0
 """Distance from whole numbers of ξ [l/L] within which a maximum is taken for an edge line."""
 LINE_CONTRAST = 10.0
-"""Ratio of a maximum on a line to the largest density 1.5 to 2.5 l/L further along it, either way,
-from which it is a wave's: a wave's own side lobes give 20, the lines of the paper's
-specimen before buckling less than 3."""
+"""Least ratio of a wave's maximum on a line to the largest density 1.5 to 2.5 l/L further along it,
+either way: a wave's own side lobes give 20, the lines of the paper's specimen before buckling less
+than 3."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Peak:
     density: float
     """S_xx + S_yy there [mm⁶]."""
     contrast: float
-    """That density over the median of all the wave vectors searched [-]."""
+    """That density over the median of all wave vectors searched [-]."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class PlaneWave:
     phase: float
     """Shift c [mm], between −l/2 and l/2; the rest is in the signs."""
     out_of_phase: float
-    """Share of the wave that no common phase of x and y describes [-]; 0 for a plain sine."""
+    """Share of the wave that isn't described by a common phase of x and y [-]; 0 for a sine."""
 
     @property
     def xi(self) -> tuple[float, float]:
@@ -90,7 +90,7 @@ class PlaneWave:
 
 
 def find_peaks(spectrum: Spectrum) -> list[Peak]:
-    """All maxima of S_xx + S_yy outside the edges' lines, or clear ones on a line, by size."""
+    """Find the maxima of S_xx + S_yy outside the edges' lines, or clear ones on a line, by size."""
     xi1, xi2, both = spectrum.window(1.0)
     S = both.sum(axis=-1)
     lobes = [spectrum.pitch / size for size in spectrum.extent]
@@ -104,10 +104,10 @@ def find_peaks(spectrum: Spectrum) -> list[Peak]:
     median = float(np.median(S[searched]))
     # Two maxima closer than a main lobe's width, l/L, are one.
     distance = max(1, round(min(lobes) / (xi1[1] - xi1[0])))
-    # Maxima of the whole plane that are searched, so the foot of a line is not one of them.
+    # Maxima of the whole plane within what is searched: the foot of a line isn't one of them.
     maxima = maximum_filter(S, 2 * distance + 1) == S
     found = [*np.argwhere(maxima & searched)]
-    # On one of the edges' lines, not where two cross, those that stand out.
+    # On one of the edges' lines, but not where two cross, maxima that stand out.
     half_plane = (xi2[:, None] > 0.5 * lobes[1]) | (xi1 > 0.5 * lobes[0])
     half_plane &= xi2[:, None] > -0.5 * lobes[1]
     for r, c in np.argwhere(maxima & (on1 != on2[:, None]) & half_plane):
@@ -124,7 +124,7 @@ def find_peaks(spectrum: Spectrum) -> list[Peak]:
 
 
 def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[PlaneWave]:
-    """Fit plane waves near some peaks, all at once, wave vectors included.
+    """Fit plane waves near the given peaks, all at once, wave vectors included.
 
     Each wave vector stays within half a main lobe, l/2L, of its peak.
     """
@@ -142,14 +142,14 @@ def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[PlaneWave]:
 
 
 def explained_share(spectrum: Spectrum, waves: Sequence[PlaneWave | Peak]) -> float:
-    """Share of the field's square, under the Hann taper, that waves there describe together [-]."""
+    """Share of the field's square, under the Hann taper, that the waves describe together [-]."""
     return _amplitudes(spectrum, _taper(spectrum), np.array([w.xi for w in waves]))[1]
 
 
 def common_phase(z: ComplexArray) -> tuple[float, FloatArray, float]:
-    """Split the phase off that both of two complex amplitudes have.
+    """Split off the phase that two complex amplitudes have in common.
 
-    The angle [rad], the (2,) real amplitudes, and the share of z that is out of phase.
+    Returns the angle [rad], the (2,) real amplitudes, and the share of z that is out of phase.
     """
     angle = 0.5 * float(np.angle(np.sum(z**2)))
     turned = z * np.exp(-1j * angle)
@@ -180,8 +180,8 @@ def _amplitudes(
 ) -> tuple[ComplexArray, float]:
     """Weighted least squares for given wave vectors.
 
-    (n, 2) complex amplitudes z [mm], the wave being Im(z exp(2πi ξ·x/l)), and the share of the
-    field's weighted square that they explain.
+    Returns (n, 2) complex amplitudes z [mm], the wave being Im(z exp(2πi ξ·x/l)), and the share of
+    the field's weighted square that they explain.
     """
     # Products of sines and cosines are those of sums and differences of their wave vectors, and
     # at a wave vector a sum over all bins is two small products of matrices.
@@ -201,20 +201,20 @@ def _amplitudes(
 
 
 PEAK_SHARE = 0.02
-"""Least density of a candidate, of the largest peak's. A wave this weak is 14 % as strong, and
-what a fit over the holes' gaps can't distinguish only makes it ill-conditioned."""
+"""Least density of a candidate, over the largest peak's. A wave this weak has 14 % of the
+amplitude; candidates that a fit can't tell apart in the material only make it ill-conditioned."""
 SAME_DENSITY = 0.02
-"""Relative difference of equal densities, 1 % of the amplitude. Symmetric meshes reach 1e-7."""
+"""Relative difference up to which densities are equal: 1 % in amplitude; symmetric meshes 1e-7."""
 SAME_LENGTH = 1e-3
 """Relative difference of wave numbers that are called equal: for lattices given with few digits."""
 GROWTH = 0.04
-"""A star of waves is worth its parameters if it explains this much more of the energy: it moves
-the material by a fifth of the field's amplitude."""
+"""Least share of the energy that a further star of waves must explain to be worth its parameters:
+it moves the material by a fifth of the field's amplitude."""
 LARGEST_CONDITION = 1e3
-"""Of the least-squares matrix of unit waves over the material. Beyond, two waves differ mostly in
-the holes, and their amplitudes grow and cancel each other in the material."""
+"""Largest condition number of the least-squares matrix of unit waves over the material. Beyond it,
+two waves differ mostly in the holes, and their amplitudes grow and cancel in the material."""
 MOST_WAVES = 12
-"""The search ends here; it is longer than any family that can be identified from images."""
+"""Most waves in the search: more than any family that can be identified from images has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,19 +226,19 @@ class Selection:
     amplitudes: ComplexArray
     """(w, 2) complex z [unit of the field]: the waves' sum is Im Σ z exp(2πi ξ·x/l)."""
     star: tuple[int, ...]
-    """(w,) which of the stars each belongs to, from 0."""
+    """(w,) number of the star that each belongs to, from 0."""
     growth: tuple[tuple[int, float], ...]
     """(number of waves, share of ∫ |u|² over the material), also beyond those chosen."""
 
     @property
     def next_gain(self) -> float:
-        """What the next star would have explained in addition [-]; 0 if there is none left."""
+        """Share that the next star would have explained in addition [-]; 0 if none is left."""
         shares = [share for count, share in self.growth if count >= len(self.xi)]
         return shares[1] - shares[0] if len(shares) > 1 else 0.0
 
 
 class WaveFit:
-    """Least squares over the material with any of some plane waves.
+    """Least-squares fits over the material by any subset of some plane waves.
 
     The field (q, 2), without mean, is given at the points of the quadrature; the candidates' wave
     vectors are (c, 2) [1/l], and l is ``pitch`` [mm].
@@ -248,7 +248,7 @@ class WaveFit:
         self, rule: MeshQuadrature, field: FloatArray, xi: FloatArray, pitch: float
     ) -> None:
         phases = 2.0 * np.pi / pitch * rule.positions @ xi.T
-        # The mean isn't the waves' business: a rigid translation is v0's.
+        # Without the mean: a rigid translation belongs to v0.
         basis = rule.without_mean(np.hstack([np.sin(phases), np.cos(phases)]))
         weighted = rule.weights[:, None] * basis
         self.count = len(xi)
@@ -295,7 +295,7 @@ def select_waves(
 
 
 def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
-    """Peaks worth considering, those that symmetry may exchange together, from right to left."""
+    """Peaks that are candidates, those that symmetry may exchange together, from right to left."""
     peaks = spectrum.peaks
     considered = [peak for peak in peaks if peak.density >= PEAK_SHARE * peaks[0].density]
     return [
@@ -305,7 +305,7 @@ def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
 
 
 def grouped(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:
-    """Each item with the first earlier one that it is like, if any has begun a group."""
+    """Group each item with the first item of an earlier group that it is like, or begin a group."""
     groups: list[list[T]] = []
     for item in items:
         own = next((group for group in groups if alike(group[0], item)), None)
@@ -326,7 +326,7 @@ def _exchangeable(first: LatticePeak, other: LatticePeak) -> bool:
 def _pursued(
     fit: WaveFit, left: dict[int, list[int]]
 ) -> tuple[list[list[int]], list[tuple[int, float]]]:
-    """Stars in the order in which they explain most, and the share after each."""
+    """Stars in the order in which they explain most, and the share explained after each."""
     order = [left.pop(0)]
     curve = [(len(order[0]), fit.solve(order[0])[1])]
     while True:

@@ -5,10 +5,10 @@ Linear propagation of the unknowns' covariance, at any positions. Two causes are
 * the images' noise, from :meth:`modeharvest.idic.result.Result.covariance`;
 * the model error w: its residual moves the unknowns, cell by cell. Taking the cells for independent
   gives the sandwich covariance H⁻¹ (Σ_b g_b g_bᵀ) H⁻¹ of robust statistics, with the block
-  gradients g_b = Σ_{x in b} Jᵀr and one block for a unit cell.
+  gradients g_b = Σ_{x in b} Jᵀr and one block per unit cell.
 
-How far a gradient moves the unknowns is a matter of the cost's Hessian H. Gauss and Newton's JᵀJ is
-that without residual; with a large w the curvature is smaller, and the same noise does more.
+How far a gradient moves the unknowns depends on the cost's Hessian H. The Gauss-Newton matrix JᵀJ
+is H without residual; with a large w the curvature is smaller, and the same noise does more.
 
 Sources: G. Besnard, F. Hild, S. Roux, Exp. Mech. 46 (2006), doi 10.1007/s11340-006-9824-8 (noise);
 H. White, Econometrica 48 (1980), doi 10.2307/1912934 (sandwich).
@@ -38,18 +38,18 @@ from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 
 _FEWEST_BLOCKS = 8
-"""Fewer blocks than this tell nothing about how their gradients scatter."""
+"""Fewest blocks from which the scatter of their gradients can be estimated."""
 _ENOUGH_PX, _STEP_PX = 200_000, 0.002
 _SMALL = np.float32(0.05)
-"""Noise is made that much smaller, and its effect larger again: the linear part is wanted."""
+"""Noise is scaled down by this factor, and its effect up again: only the linear part counts."""
 _EXAMPLES = 4
-"""Of filtered noise: with 100 cells a standard deviation is good to 4 %."""
+"""Realisations of filtered noise: with 100 cells a standard deviation is good to 4 %."""
 
 
 def covariance(
     result: Result, pair: ImagePair, noise: ImageNoise, block: float, edge_px: int
 ) -> Covariance:
-    """Find the covariances of the unknowns of a correlation, by the images without final smoothing.
+    """Find the covariances of a correlation's unknowns; ``pair``: images without final smoothing.
 
     Blocks of edge ``block`` [mm], the unit cell, are taken for independent; ``edge_px`` as in
     :class:`~modeharvest.idic.setup.CorrelationOptions`.
@@ -72,7 +72,7 @@ def covariance(
 def _smoothed_noise(
     pair: ImagePair, blur_px: float, noise: ImageNoise
 ) -> Iterator[tuple[FloatImage, FloatImage]]:
-    """What a blur makes of examples of white noise in both images."""
+    """Realisations of white noise in both images, after the blur."""
     rng = np.random.default_rng(0)
     without = smoothed_pair(pair, blur_px)
     for _ in range(_EXAMPLES):
@@ -91,14 +91,14 @@ class MatchedImages:
     result: Result
     reference: FloatImage
     deformed: FloatImage
-    """(rows, cols) f, and g continued into its holes [grey levels]: without that g has edges at its
-    holes, whose curvature is none of the cost's."""
+    """(rows, cols) f, and g continued into its holes [grey levels]: otherwise g would have edges at
+    its holes, whose curvature isn't the cost's."""
     used: BoolArray
     """(rows, cols) True on the pixels that count."""
 
     @classmethod
     def of(cls, result: Result, pair: ImagePair, edge_px: int) -> MatchedImages:
-        """Prepare the images of a result once more as the last level of its correlation did."""
+        """Prepare the images of a result again as the last level of its correlation did."""
         level = level_pair(pair, FULL, edge_px, result.order)
         assert level.valid is not None  # on the finest level
         every = Assembly(result.ansatz, result.grid, level.mask)
@@ -110,10 +110,10 @@ class MatchedImages:
 
     @cached_property
     def inverse_hessian(self) -> FloatArray:
-        """(n, n) inverse of the cost's own curvature H; infinite where M⁻¹ is.
+        """(n, n) inverse of the cost's Hessian H; infinite where M⁻¹ is.
 
-        H by differences of the gradient; of large images from some of the rows, which is what the
-        speckles in them are many enough for.
+        H is found by differences of the gradient; for large images on some of the rows, which show
+        enough speckles.
         """
         result, mask = self.result, self.used
         every = int(np.clip(mask.sum() // _ENOUGH_PX, 1, 4))
@@ -141,10 +141,10 @@ class MatchedImages:
         return found
 
     def hessian_corrected_covariance(self, noise: ImageNoise | float) -> FloatArray:
-        """(n, n) covariance by white noise in both images against the cost's own curvature.
+        """(n, n) covariance by white noise in both images, with the cost's Hessian.
 
-        H⁻¹ V H⁻¹, where V = M C M, C = ``result.covariance(noise)`` and M is Gauss and Newton's
-        curvature. Where the residual is noise there is no such difference, and C itself is given.
+        H⁻¹ V H⁻¹, where V = M C M, C = ``result.covariance(noise)`` and M is the Gauss-Newton
+        matrix. Where the residual is noise, H and M are the same, and C itself is returned.
         """
         result = self.result
         found = result.covariance(noise)
@@ -161,7 +161,7 @@ class MatchedImages:
     def sandwich_covariance(self, block: float) -> FloatArray:
         """(n, n) covariance of the unknowns by the model error, by blocks of edge ``block`` [mm].
 
-        The images' noise is in it, too: it is in the residual. Where w has the lattice's own period
+        It includes the images' noise, which is in the residual. If w has the lattice's own period,
         the block gradients are alike, and their independence is an assumption. Raises InputError if
         there are fewer than eight blocks.
         """
@@ -172,13 +172,13 @@ class MatchedImages:
         self, examples: Iterable[tuple[FloatImage, FloatImage]], block: float,
         inverse: FloatArray | None = None,
     ) -> FloatArray:  # fmt: skip
-        """(n, n) covariance of the unknowns by noise of any kind, from examples of it.
+        """(n, n) covariance of the unknowns by noise of any kind, from realisations of it.
 
-        For images that were filtered before they were correlated: their noise is not white any
-        more, and :meth:`modeharvest.idic.result.Result.covariance` does not hold. Every example
-        gives each block a gradient; the covariance is their mean square. What the noise does to the
-        gradient that w is seen with is in it. The examples are of the noise in f and in g, (rows,
-        cols) each, filtered as they were; ``inverse`` (n, n) stands for :attr:`inverse_hessian`.
+        For images that were filtered before they were correlated: their noise is no longer white,
+        and :meth:`modeharvest.idic.result.Result.covariance` does not hold. Every realisation gives
+        each block a gradient; the covariance is their mean square. The effect of noise on the
+        gradient that weighs w is included. ``examples``: noise in f and in g, (rows, cols) each,
+        filtered as the images were; ``inverse`` (n, n) is used in place of :attr:`inverse_hessian`.
         """
         blocks, f, g = self._blocks(block), self.reference, self.deformed
         without = self._block_gradients(blocks, f, g)
@@ -211,7 +211,7 @@ class MatchedImages:
 
 
 def _sandwich(inverse: FloatArray, gradients: FloatArray) -> FloatArray:
-    """H⁻¹ (Σ g gᵀ) H⁻¹; infinite for unknowns that the images say nothing about."""
+    """H⁻¹ (Σ g gᵀ) H⁻¹; infinite for unknowns that the images don't determine."""
     known, lost = determined_part(inverse)
     half = gradients @ known
     found = half.T @ half
@@ -224,7 +224,7 @@ class FieldErrors:
     """Standard deviations at positions that broadcast to a shape (...)."""
 
     covariance: FloatArray
-    """(n, n) of the unknowns, which they are made of."""
+    """(n, n) covariance of the unknowns, from which these are propagated."""
     v0: FloatArray
     """(..., 2) of the slow field's components [mm]."""
     v: FloatArray

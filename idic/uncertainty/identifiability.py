@@ -15,18 +15,18 @@ from modeharvest.util.scaled_eigen import ScaledEigen
 _POINTS = 4000  # at which displacements are compared
 _LISTED = 3  # combinations, and terms of each
 FINE = 5.0
-"""Where w is 2 px rms, IDIC is 0.25 px from the best fit with speckles of 12 px, 0.47 px with 0.7
-times that, at a local minimum with half of it (docs/how-to/studies.md, size of the speckle)."""
+"""Least speckle size over w: for w of 2 px rms, IDIC is 0.25 px off the best fit with speckles of
+12 px, 0.47 px with 0.7 of that, in a local minimum with half (docs/explanation/systematic.md)."""
 OBSERVABLE = 2.0
-"""A mode counts as observable if v_i phi_i is that many times the model error."""
+"""A mode counts as observable if v_i phi_i is at least this many times the model error."""
 
 
 @dataclass(frozen=True)
 class Combination:
-    """Unknowns that the images hardly distinguish."""
+    """A combination of unknowns that the images hardly determine."""
 
     eigenvalue: float
-    """Of the column-scaled Gauss-Newton matrix, whose eigenvalues have the mean 1 [-]."""
+    """Eigenvalue of the column-scaled Gauss-Newton matrix [-]; the mean of all is 1."""
     terms: tuple[tuple[str, float], ...]
     """The largest parts: name of the unknown and its weight in the scaled eigenvector."""
 
@@ -37,19 +37,19 @@ class Combination:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """How well a correlation's unknowns are determined."""
+    """Measures of how well a correlation's unknowns are determined."""
 
     condition_number: float
-    """Of the column-scaled Gauss-Newton matrix."""
+    """Condition number of the column-scaled Gauss-Newton matrix."""
     undetermined: tuple[str, ...]
-    """Names of the unknowns that the images say nothing about."""
+    """Names of the unknowns that the images don't determine."""
     worst: tuple[Combination, ...]
     """The worst-determined combinations of the others, the worst first."""
     overlap: tuple[float, ...]
-    """For each mode the largest cosine between a displacement that its v_i and phi_i can make and
-    one that v0 can make [-]: 1 would mean that they are one."""
+    """For each mode the largest cosine between a displacement by its v_i and phi_i and one by v0
+    [-]; 1 means that both can describe the same displacement."""
     model_error_px: float
-    """Estimate, rms per component: residual over grey-level gradient [px]."""
+    """Estimated model error, rms per component: residual over grey-level gradient [px]."""
     amplitude_px: tuple[float, ...]
     """For each mode the rms of v_i phi_i per component [px]."""
     speckle_px: float = np.inf
@@ -57,13 +57,13 @@ class Identifiability:
 
     @property
     def unobservable(self) -> tuple[int, ...]:
-        """Numbers (from 0) of the modes that are too weak for phi_i to mean anything."""
+        """Numbers (from 0) of the modes that are too weak for phi_i to be meaningful."""
         least = OBSERVABLE * self.model_error_px
         return tuple(i for i, size in enumerate(self.amplitude_px) if size < least)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a user should know, one sentence each."""
+        """Warnings for the user, one sentence each."""
         has_others = len(self.unobservable) < len(self.amplitude_px)
         why = ("before buckling there is no pattern to measure", "others are")[has_others]
         found = [
@@ -87,9 +87,9 @@ class Identifiability:
 
 
 def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiability:
-    """Look at the Gauss-Newton matrix and at the displacements that the unknowns make.
+    """Examine the Gauss-Newton matrix and the displacements that the unknowns cause.
 
-    Of a correlation, or of a fit to a displacement (then ``model_error_px`` is its residual); the
+    For a correlation, or a fit to a displacement (then ``model_error_px`` is its residual); the
     mask (rows, cols) is True on material, everywhere by default. Raises InputError if it is not of
     the images' size or has no material.
     """
@@ -125,7 +125,7 @@ def _sensitivities(result: Result, mask: ArrayLike | None) -> tuple[FloatArray, 
 
 
 def _orthonormal(columns: FloatArray) -> FloatArray:
-    """A basis of what the columns span; columns of nothing are left out."""
+    """An orthonormal basis of the columns' span; columns of zeros are left out."""
     lengths = np.linalg.norm(columns, axis=0)
     used = columns[:, lengths > 0] / lengths[lengths > 0]
     left, sizes, _ = np.linalg.svd(used, full_matrices=False)

@@ -1,4 +1,4 @@
-"""Which parameters the data determine, which only together, and which of several models."""
+"""Parameters that the data determine, alone or only together; comparison of several models."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from modeharvest.util.arrays import FloatArray
 
 _LARGE = 0.2
-"""Relative standard deviation of a combination of parameters beyond which words say so."""
+"""Relative standard deviation of a combination of parameters from which on it is reported."""
 _PART = 0.3
-"""Of an eigenvector's largest component: which parameters a combination is of."""
+"""Least component of an eigenvector, over its largest, of a parameter that is named."""
 _GEOMETRY = ": leave one of them out, give it a prior_sd, or add a state nearer to buckling"
-"""What helps holes and edges, whose names have a dot."""
+"""Remedy for parameters of holes and edges, whose names have a dot."""
 
 
 def undetermined_combinations(
     names: Sequence[str], normal_matrix: FloatArray, scales: Sequence[float], remedy: str = ""
 ) -> list[str]:
-    """Combinations of parameters that are known to no better than 20 %, each in words.
+    """Describe the combinations of parameters that are known to no better than 20 %, in words.
 
     normal_matrix : (k, k) of the cost in natural weights: the inverse of the covariance.
-    scales : what changes of each parameter are compared with.
-    remedy : what the words end with, unless a hole or an edge is in the combination.
+    scales : values that changes of each parameter are compared with.
+    remedy : end of the text, unless a hole or an edge is in the combination.
     """
     squares, vectors = np.linalg.eigh(normal_matrix * np.outer(scales, scales))
     with np.errstate(divide="ignore"):
@@ -48,17 +48,17 @@ def undetermined_combinations(
 
 
 _GRADES = ((10.0, "decisive"), (6.0, "strong"), (2.0, "positive"))
-"""Twice the logarithm of a Bayes factor from which on evidence is called so: Kass & Raftery, J. Am.
+"""Twice the logarithm of a Bayes factor above which evidence has that name: Kass & Raftery, J. Am.
 Stat. Assoc. 90 (1995) 773-795, doi 10.1080/01621459.1995.10476572 ("very strong" there)."""
 
 
 def compared_by_evidence(
     names: Sequence[str], evidence: Sequence[tuple[float, float]], rejected: Sequence[str]
 ) -> str:
-    """Which of several models the data prefer, in words.
+    """Say in words which of several models the data prefer.
 
-    evidence : logarithm of each, and what of it is by the mesh: the Bayes factor is as uncertain.
-    rejected : those that a test of their own rejects.
+    evidence : logarithm of each, and its part due to the mesh, which is the Bayes factor's error.
+    rejected : names of the models that a test of their own rejects.
     """
     values, by_mesh = np.array(evidence).T
     best, second = (int(k) for k in np.argsort(-values)[:2])

@@ -1,9 +1,9 @@
-"""Displacements of the ansatz beside a model's, where the model is not trusted.
+"""Displacements of the ansatz added to a model's, where the model is not trusted.
 
-u = u(p) + v0(X) + v1(X) phi1(X), in each state its own: products of Legendre's polynomials
-P_i(x/a) P_j(y/b) over the specimen, along x, along y, or of its pattern phi1. What supports,
-friction or a flaw of the specimen do to a state without a parameter for it is left to v0 and v1;
-material and forces stay the model's.
+u = u(p) + v0(X) + v1(X) phi1(X), with v0 and v1 of each state: products of Legendre polynomials
+P_i(x/a) P_j(y/b) over the specimen, along x, along y, or along its pattern phi1. The effects of
+supports, friction or flaws of the specimen that have no parameter in a state are left to v0 and v1;
+material and forces remain the model's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
 
 _NAME = re.compile(r"(?:v0\[(\d+)\]\.([xy])|v1\[(\d+)\])\[(\d+), ?(\d+)\]")
 NAMES = ("v0[k].x[i,j]", "v0[k].y[i,j]", "v1[k][i,j]")
-"""Of terms: along x, along y and along the pattern in the state number k, from 0."""
+"""Names of terms along x, along y and along the pattern in the state number k, from 0."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Term:
 
     @classmethod
     def named(cls, name: str, states: int) -> Term | None:
-        """That of a name as in NAMES; None of another one.
+        """Make the term of a name as in NAMES; None for another name.
 
         InputError if there is no such state or too high a degree.
         """
@@ -59,7 +59,7 @@ class Term:
 
 
 def terms_of(names: Iterable[str], states: int) -> dict[str, Term]:
-    """The terms among some unknowns, by their names, see :meth:`Term.named`."""
+    """The terms among the names of some unknowns, by name, see :meth:`Term.named`."""
     named = ((name, Term.named(name, states)) for name in names)
     return {name: term for name, term in named if term is not None}
 
@@ -68,11 +68,11 @@ def with_terms(
     states: list[ModelState], terms: Collection[Term], values: FloatArray, nodes: FloatArray,
     specimen: Specimen,
 ) -> list[ModelState]:  # fmt: skip
-    """A model's states with terms beside them; derivatives by all are put behind their own.
+    """Add terms to a model's states; derivatives by terms follow the model's own.
 
-    values : (j,) of the terms [mm].
-    nodes : (n, 2) of the mesh where the specimen has them [mm]: terms go with nodes that parameters
-        move.
+    values : (j,) unknowns of the terms [mm].
+    nodes : (n, 2) nodes of the mesh, at their places in the specimen [mm]: terms move with nodes
+        that parameters move.
     """
     if not terms:
         return states

@@ -1,8 +1,8 @@
 """Integrated DIC in the full sense: the unknowns are parameters of a finite-element model.
 
 Minimises one cost in natural weights: grey levels by the camera's noise, displacements of another
-measurement by theirs, forces by the load cell's noise, nominal strains and priors by their own. The
-model gives nodal displacements u(p) on its mesh with their sensitivities. Source: Neggers, Allix,
+measurement and forces by their noise, nominal strains and priors by their own. The model gives
+nodal displacements u(p) on its mesh with their sensitivities. Source: Neggers, Allix,
 Hild & Roux, Arch. Comput. Methods Eng. 25 (2018) 533-573, doi 10.1007/s11831-016-9181-z.
 """
 
@@ -40,17 +40,17 @@ if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
     from modeharvest.fem.path.parametric import ParametricState as ModelState
 
 LEVELS = (Level(2, 3.0), Level(2, 1.5), FULL)
-"""Of the images, from coarse to fine."""
+"""Levels of the images, from coarse to fine."""
 _COARSE = GaussNewtonOptions(tolerance_px=2e-2, max_iterations=20)
 _FINE = GaussNewtonOptions(tolerance_px=1e-4, max_iterations=30)
 _FORCE_PX = 0.01
 """A change of a force by its standard deviation counts as this in the length of a step [px]."""
 _HOLD = 0.3
-"""Standard deviation, in scales, of unknowns about where a coarse level begins: blurred images know
-some of them hardly, and far off the model is another one."""
-_ROUNDS = 4  # of steps with a residual of another mesh or other slopes, at most
-_SETTLED = 0.05  # standard errors, rms: of the last of them
-_UNLIKE = 1.5  # times what noise alone makes: a residual that says so
+"""Standard deviation, in scales, of unknowns about their values at the beginning of a coarse level:
+blurred images hardly determine some of them, and far off, the model is another one."""
+_ROUNDS = 4  # most steps with a residual of another mesh or other slopes
+_SETTLED = 0.05  # length of the last of those steps in standard errors, rms
+_UNLIKE = 1.5  # residual, over that of noise alone, from which on states are unlike the data
 
 
 class UnlikeDataError(InputError):
@@ -58,16 +58,16 @@ class UnlikeDataError(InputError):
 
 
 Model = Callable[[FloatArray], "Sequence[ModelState]"]
-"""The states for values of the unknowns (k,); InputError where there are none."""
+"""From values of the unknowns (k,) to the states; InputError where there are none."""
 
 
 class FinerMesh(NamedTuple):
-    """What the same states are on a finer mesh."""
+    """The same states on a finer mesh."""
 
     model: Model
-    """Of the same states; their derivatives are of no account."""
+    """Model of the same states; their derivatives aren't used."""
     error_ratio: float
-    """Of its error to that of the model's own [-]."""
+    """Ratio of its error to that of the original model [-]."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Unknown:
     start: float
     bounds: tuple[float, float]
     prior_sd: float | None = None
-    """Standard deviation of what is known beforehand, about the start; None for nothing."""
+    """Standard deviation of prior knowledge, about the start; None for none."""
 
     def __post_init__(self) -> None:
         low, high = self.bounds
@@ -90,7 +90,7 @@ class Unknown:
             raise InputError(f"expected a prior_sd above 0, got {self.prior_sd:g}")
 
     def scale(self, value: float) -> float:
-        """What changes of it are compared with: itself, or its bounds' distance if it may be 0."""
+        """What its changes are compared with: itself, or half its bounds' gap if it may be 0."""
         low, high = self.bounds
         return abs(value) if low * high > 0.0 else 0.5 * (high - low)
 
@@ -103,7 +103,7 @@ class Readings:
     sd: FloatArray | float
 
     def residuals(self, states: Sequence[ModelState], name: str) -> Iterator[tuple[float, Any]]:
-        """Residual over its standard deviation, and minus its derivatives, of each reading."""
+        """Residual over its standard deviation, and minus its derivatives, for each reading."""
         sds = np.broadcast_to(self.sd, self.values.shape)
         for value, state, sd in zip(self.values, states, sds, strict=False):
             if np.isfinite(value):
@@ -113,47 +113,47 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """Parameters of a model as the data have them."""
+    """The parameters of a model that were identified from data."""
 
     unknowns: dict[str, Unknown]
     values: FloatArray
     """(k,) in the order of the unknowns."""
     covariance: FloatArray
-    """(k, k) by noise, that of a reference which several states share included."""
+    """(k, k) due to noise, including that of a reference which several states share."""
     covariance_with_model_error: FloatArray
-    """(k, k) by what the residual is, from part to part of the body, in place of its noise; that of
-    forces and strains at least their noise."""
+    """(k, k) due to the residual, from part to part of the body, in place of noise; forces and
+    strains count with their noise at least."""
     minimum: Minimum
     states: list[ModelState]
     state_equations: list[StateEquations]
-    """Of the states, which are those of ``minimum.unknowns``."""
+    """Equations of the states, which are those of ``minimum.unknowns``."""
     evaluations: int
-    """How often the model was solved."""
+    """Number of solutions of the model."""
     mesh_error: FloatArray
-    """(k,) taken for what the finer mesh leaves, and added to the values: from how far it moved
-    them and the ratio of errors; 0 where there was no finer mesh."""
+    """(k,) estimated remaining error of the finer mesh, which was added to the values: from their
+    change by that mesh and the ratio of errors; 0 without a finer mesh."""
     equations: list[Callable[[], NormalEquations]]
-    """By the data as they are prepared: at the states, and at those with elements of no size."""
+    """Equations of the prepared data, at the states, and at those for elements of zero size."""
     forces: Readings | None = None
     model_error: ScoreTest | None = None
     law_error: ScoreTest | None = None
-    """Whether the model can be right, by corrections that know no law, and whether its law can, by
-    terms of the energy that it may lack; where they were given to test it with."""
+    """Tests whether the model can be right, by corrections independent of the law, and whether its
+    law can, by terms of the energy that it may lack; None where these weren't given."""
 
     @property
     def sd(self) -> FloatArray:
-        """(k,) standard deviations by noise; infinite where nothing determines an unknown."""
+        """(k,) standard deviations due to noise; infinite where an unknown is undetermined."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def sd_with_model_error(self) -> FloatArray:
-        """(k,) by noise or by the residual, whichever is larger, and by the mesh."""
+        """(k,) due to noise or to the residual, whichever is larger, and due to the mesh."""
         variance = np.maximum(np.diag(self.covariance_with_model_error), np.diag(self.covariance))
         return np.asarray(np.hypot(np.sqrt(variance), self.mesh_error))
 
     @property
     def correlations(self) -> FloatArray:
-        """(k, k) by noise [-]."""
+        """(k, k) correlations of the unknowns due to noise [-]."""
         return np.asarray(self.covariance / np.outer(self.sd, self.sd))
 
     @property
@@ -164,19 +164,19 @@ class Identified:
         return np.asarray(np.sqrt(variance))
 
     def log_evidence(self) -> tuple[float, float]:
-        """Logarithm of the evidence but for what all models share; what of it comes by the mesh.
+        """Logarithm of the evidence, up to a term common to all models; the part due to the mesh.
 
-        Marginal likelihood by Laplace's method, unknowns without a prior uniform within bounds:
-        MacKay, Neural Comput. 4 (1992) 415-447, doi 10.1162/neco.1992.4.3.415. Of several models
-        comparable after all have been identified, by the same prepared data.
+        Marginal likelihood by Laplace's method; unknowns without a prior are uniform within their
+        bounds: MacKay, Neural Comput. 4 (1992) 415-447, doi 10.1162/neco.1992.4.3.415. Comparable
+        between models after all have been identified, from the same prepared data.
         """
         H, costs = self.minimum.equations.matrix, list[float]()
         for at in (equations() for equations in self.equations):
-            # Unknowns would move to where the cost of these states is least.
+            # Unknowns would move to the least cost of these states.
             costs.append(at.cost - 0.5 * float(at.gradient @ ScaledEigen.of(H).solve(at.gradient)))
         unknowns = self.unknowns.values()
         sizes = [u.prior_sd or float(np.ptp(u.bounds)) / np.sqrt(2.0 * np.pi) for u in unknowns]
-        # An unknown that nothing determines has its bounds' width, and costs nothing.
+        # An unknown that nothing determines has the width of its bounds, and costs nothing.
         bounded = np.diag([float(u.prior_sd is None) for u in unknowns])
         occam = 0.5 * float(np.linalg.slogdet(H * np.outer(sizes, sizes) + bounded)[1])
         return -costs[1] - occam, costs[0] - costs[1]
@@ -212,7 +212,7 @@ class Identified:
 
 @dataclass(eq=False)
 class _Cost:
-    """The cost and its normal equations, of the data of one level."""
+    """The cost and its normal equations, for the data of one level."""
 
     model: Model
     data: Sequence[StateObservation | None]
@@ -221,12 +221,12 @@ class _Cost:
     strains: Readings | None
     px: float
     hold: FloatArray | None = None
-    """(k,) about which coarse levels hold the unknowns; None for the finest."""
+    """(k,) values about which coarse levels hold the unknowns; None on the finest level."""
     evaluations: int = 0
     _states: dict[bytes, list[ModelState]] = field(default_factory=dict)
 
     def states(self, values: FloatArray) -> list[ModelState]:
-        """The model's, of which the last few are kept."""
+        """The model's states, of which the last few are cached."""
         key = values.tobytes()
         if key not in self._states:
             self.evaluations += 1
@@ -237,7 +237,7 @@ class _Cost:
         return self._states[key]
 
     def state_equations(self, states: Sequence[ModelState]) -> list[StateEquations]:
-        """Of the states with images or displacements."""
+        """Equations of the states with images or displacements."""
         return [data.equations(s) for data, s in zip(self.data, states, strict=True) if data]
 
     def scalars(self, states: Sequence[ModelState], values: FloatArray) -> list[tuple[float, Any]]:
@@ -257,7 +257,7 @@ class _Cost:
         return found
 
     def equations(self, values: FloatArray, _with_matrix: bool = True) -> NormalEquations:
-        """Of everything; an infinite cost beyond bounds and where the model has no states."""
+        """Equations of all data; an infinite cost beyond bounds or if the model has no states."""
         count = len(values)
         nothing = NormalEquations(np.zeros((count, count)), np.zeros(count), np.inf, 1, 0)
         bounds = np.array([u.bounds for u in self.unknowns.values()])
@@ -271,7 +271,7 @@ class _Cost:
             return nothing
 
     def equations_at(self, states: Sequence[ModelState], values: FloatArray) -> NormalEquations:
-        """Of everything, with the model's states at these values."""
+        """Equations of all data, with the model's states at these values."""
         matrix: FloatArray = np.zeros((len(values),) * 2)
         gradient: FloatArray = np.zeros(len(values))
         squares, number = 0.0, 0
@@ -284,7 +284,7 @@ class _Cost:
         return NormalEquations(matrix, gradient, 0.5 * squares, number, 0)
 
     def step_length(self, before: FloatArray, after: FloatArray) -> float:
-        """Rms change of the displacements [px], or what changes of forces count as."""
+        """Rms change of the displacements [px], or the equivalent of changes of forces."""
         states, change = self.states(before), after - before
         squares = [
             np.mean(np.tensordot(change, s.displacement_by, 1) ** 2) / self.px**2 for s in states
@@ -311,28 +311,28 @@ def identify(
     unlike_is_error: bool = False,
     progress: Progress = silent,
 ) -> Identified:
-    """Find the unknowns for which a model's states look like the data; InputError without states.
+    """Find the unknowns for which a model's states match the data; InputError without states.
 
-    model : gives as many states as there are data, with derivatives by the unknowns in their order.
+    model : gives one state for each entry of ``data``, with derivatives in the unknowns' order.
     data : images or displacements of each state, or None where there is only a force.
-    pixel_size : lengths of steps are counted in it [mm].
-    forces : readings [N/mm], NaN where there is none; of the first states.
+    pixel_size : unit of the lengths of steps [mm].
+    forces : readings of the first states [N/mm], NaN where there is none.
     strains : readings of nominal strains, NaN where there is none; they count for states that are
-        found by something else, an amplitude or as critical ones.
-    finer : a finer mesh, whose residual the last steps take, with this one's sensitivities; from
-        both the values are extrapolated to no error (Richardson).
-    corrections : (j, n, 2) of each state's nodal displacements that no law bounds [-], by which the
-        model is tested.
+        determined by something else, an amplitude or as critical ones.
+    finer : a finer mesh, whose residual is used in the last steps with the sensitivities of this
+        one; from both, the values are extrapolated to zero error (Richardson).
+    corrections : (j, n, 2) nodal displacements of each state that are independent of the law [-],
+        by which the model is tested.
     omitted : the states with derivatives by further parameters alone, which are 0 in the model:
         factors of terms that its law may lack, by which the law is tested.
-    unlike_is_error : whether residuals far above noise are an UnlikeDataError, before the finer
-        mesh is asked; else a statement says so.
+    unlike_is_error : whether residuals far above noise raise UnlikeDataError, before the finer mesh
+        is used; otherwise a statement says so.
     """
     if not any(data) and forces is None:
         raise InputError("expected images, displacements or forces to identify from, got none")
     cost = _Cost(model, data, unknowns, forces, strains, pixel_size)
     values = np.array([unknown.start for unknown in unknowns.values()])
-    # The last one twice: where material ends in the deformed image is known by the model alone.
+    # The last one twice: only the model shows where material ends in the deformed image.
     stages = [*levels, levels[-1]] if any(isinstance(d, ImageData) for d in data) else [FULL]
     found: Minimum | None = None
     for number, level in enumerate(stages):
@@ -368,7 +368,7 @@ def are_unlike(shares: Sequence[StateEquations]) -> bool:
 
 
 def _finished(cost: _Cost, values: FloatArray, model: Model) -> tuple[FloatArray, list[ModelState]]:
-    """Values and states by Gauss-Newton steps with another model's residual: no sensitivities."""
+    """Gauss-Newton steps with another model's residual, but these sensitivities: values, states."""
     bounds = np.array([u.bounds for u in cost.unknowns.values()])
     for _ in range(_ROUNDS):
         states = [
@@ -391,9 +391,9 @@ def _assessed(
     cost: _Cost, states: list[ModelState], found: Minimum, off: FloatArray, factor: float,
     corrections: FloatArray | None, omitted: Model | None,
 ) -> Identified:  # fmt: skip
-    """The result: covariances by noise and by the residual from block to block, test of the model.
+    """Make the result: covariances by noise and by the residual of blocks, tests of the model.
 
-    factor : of the states' change by the finer mesh, for what that leaves.
+    factor : of the change of states by the finer mesh, for its remaining error.
     """
     values = found.unknowns
     found = replace(found, equations=cost.equations_at(states, values))
@@ -401,7 +401,7 @@ def _assessed(
     known = np.isfinite(np.diag(inverse))
     half = np.where(np.outer(known, known), inverse, 0.0)
     shares, k = cost.state_equations(states), len(values)
-    # Of parts of the body: noise of the reference and errors of the model are in all states.
+    # By parts of the body, because noise of the reference and model errors are in all states.
     blocks = np.zeros((max([len(s.blocks) for s in shares], default=0), k))
     for share in shares:
         blocks[: len(share.blocks)] += share.blocks

@@ -1,10 +1,10 @@
 """Test of model error: whether corrections of a model would lower the cost by more than noise.
 
-Where a model is right, the score of corrections, the cost's slope along them with the parameters
-free, is noise of known covariance V, and its square in units of V is chi squared: Rao, Math. Proc.
-Camb. Phil. Soc. 44 (1948), doi 10.1017/S0305004100023987; Breusch & Pagan, Rev. Econ. Stud. 47
-(1980), doi 10.2307/2297111. Corrections are terms of the law's energy, or displacements that know
-of no law and no support: polynomials times 1 and times waves of the lattice's periods.
+If a model is right, the score of corrections (the cost's slope along them with the parameters free)
+is noise of known covariance V, and its square in units of V is chi squared: Rao, Math. Proc. Camb.
+Phil. Soc. 44 (1948), doi 10.1017/S0305004100023987; Breusch & Pagan, Rev. Econ. Stud. 47 (1980),
+doi 10.2307/2297111. Corrections are terms of the law's energy, or displacements that are
+independent of law and supports: polynomials times 1 and times waves of the lattice's periods.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class ScoreTest:
     p_value: float
     """Probability of such a chi squared or a larger one if the model is right [-]."""
     rms: float
-    """Size of corrections that would make chi squared exceed its expectation by as much."""
+    """Size of corrections that would raise chi squared above its expectation by this excess."""
 
     @property
     def is_rejected(self) -> bool:
-        """Whether noise alone would hardly do this."""
+        """Whether noise alone would hardly cause such a chi squared."""
         return self.p_value < _SIGNIFICANT
 
     def __str__(self) -> str:
@@ -51,7 +51,7 @@ class ScoreTest:
 
 
 def in_words(model: ScoreTest | None, law: ScoreTest | None) -> list[str]:
-    """What the tests of a model and of its law say."""
+    """State the results of the tests of a model and of its law in words."""
     found = list[str]()
     if model:
         wrong = f"wrong, by displacements of {1e3 * model.rms:.2g} um rms,"
@@ -64,7 +64,7 @@ def in_words(model: ScoreTest | None, law: ScoreTest | None) -> list[str]:
 
 
 class JointScore(NamedTuple):
-    """Of parameters and corrections of a model, n together."""
+    """Joint score of the parameters and corrections of a model, n together."""
 
     score: FloatArray
     """(n,) minus the slope of the cost."""
@@ -72,13 +72,13 @@ class JointScore(NamedTuple):
     noise: FloatArray
     """(n, n) second derivatives of the cost (Gauss-Newton), and the score's covariance by noise."""
     by_mesh: FloatArray
-    """(n, m) what of the score the model's mesh is expected to make, by each of m causes."""
+    """(n, m) expected part of the score due to the model's mesh, by each of m causes."""
 
     def test(self, parameters: int, first: int, last: int) -> ScoreTest:
-        """Test the corrections from first to last, with the parameters, those before, free."""
+        """Test corrections ``first`` to ``last`` with the parameters, which come first, free."""
         p, q = np.arange(parameters), np.arange(first, last)
         inverse = ScaledEigen.of(self.information[np.ix_(p, p)]).inverse()
-        # What of the score the parameters would take up when they moved.
+        # Part of the score that the parameters would take up when they move.
         C = np.zeros((len(q), len(self.score)))
         C[:, p] = -self.information[np.ix_(q, p)] @ np.where(np.isfinite(inverse), inverse, 0.0)
         C[:, q] = np.eye(len(q))
@@ -100,12 +100,12 @@ def joint_score(
     corrections: FloatArray,
     readings: int,
 ) -> JointScore:
-    """Joint score of the parameters of states, and of corrections of each.
+    """Joint score of the parameters of states, and of the corrections of each state.
 
-    extrapolated : the states as they are expected to be with elements of no size.
-    scalars, expected : residuals of single numbers with minus their derivatives, and with those.
-    corrections : (j, n, 2) displacements, of which every state is given a combination of its own.
-    readings : the first so many scalars have a correction each, too, last of all.
+    extrapolated : the states as they are expected to be for elements of zero size.
+    scalars, expected : residuals of single numbers with minus their derivatives; and with those.
+    corrections : (j, n, 2) displacements, of which every state has a combination of its own.
+    readings : number of the first scalars that have a correction each, too, the last ones of all.
     """
     k, j = len(states[0].displacement_by), len(corrections)
     seen: list[Any] = [each for each in zip(data, states, extrapolated, strict=True) if each[0]]
@@ -144,8 +144,8 @@ def joint_score(
 def corrections(points: FloatArray, vectors: FloatArray, degree: int = 2) -> FloatArray:
     """(j, n, 2) displacements of rms 1 that no law bounds, at points (n, 2) of a body [-].
 
-    vectors : (2, 2) the lattice's as rows [mm]. Waves have its period and twice that; polynomials
-        go up to the degree.
+    vectors : (2, 2) lattice vectors as rows [mm]. Waves have the lattice's period and twice that;
+        polynomials have total degrees up to ``degree``.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     x, y = (2.0 * (points - low) / (high - low) - 1.0).T

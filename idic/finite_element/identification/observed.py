@@ -1,9 +1,9 @@
-"""What is observed of a state, images or displacements, against a model's nodal displacements.
+"""Observations of a state, images or displacements, compared with a model's nodal displacements.
 
 A pixel x in an element has J = grad g(x + u) . sum N_a S_a, with the sensitivities S = du/dp of the
-nodes to a model's parameters. So their normal equations are those of the nodes, projected. Where
-parameters move nodes by X', a pixel sees of u' at nodes only S = u' - grad u . X': a point of the
-material stays where the reference shows it. Pixels are sorted by elements anew on every level.
+nodes to a model's parameters. So the normal equations of the parameters are the projected ones of
+the nodes. Where parameters move nodes by X', a pixel sees only S = u' - grad u . X' of u' at nodes:
+a point of the material stays where the reference shows it. Pixels are sorted anew on every level.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ if TYPE_CHECKING:  # dolfinx makes the model; nothing here needs it
     from modeharvest.fem.path.parametric import ParametricState as ModelState
 
 _EDGE_PX = 2
-"""Left out at edges: with 1 px more is known, but what g is continued by shows."""
+"""Pixels left out at edges: 1 px would give more information, but errors of g's continuation."""
 _LEAST_DET = 0.1
 _MOST_NOISE = 0.9  # of the mean square slope
 _TINY = float(np.finfo(np.float64).tiny)
 _CHUNK = 1024  # elements
 _ALONG = 8
-"""Parts of the body along its length whose residuals are taken for independent."""
+"""Parts of the body along its length whose residuals are taken to be independent."""
 
 
 @dataclass(frozen=True, eq=False)
 class StateEquations:
-    """A state's share of the normal equations of the k unknowns, by the data's weights."""
+    """Contribution of a state to the normal equations of the k unknowns, by the data's weights."""
 
     blocks: FloatArray
     """(b, k): -J'r of parts of the data that are far from each other."""
@@ -58,45 +58,45 @@ class StateEquations:
     squares: float
     count: int
     residual: float
-    """Rms of what is compared: grey levels, or mm per component."""
+    """Rms residual of what is compared: grey levels, or mm per component."""
     expected: float
-    """The same by noise alone."""
+    """The rms residual due to noise alone."""
     shared: float = 0.0
-    """Of the noise of a reference that states share: their gradients have the covariance of two
-    such factors times the product that :meth:`ImageData.shared` gives."""
+    """Factor of the noise of a reference that states share: their gradients have the covariance of
+    two such factors times the product that :meth:`ImageData.shared` gives."""
 
 
 Light = Callable[[ImagePair, Mesh, FloatArray], ImagePair]
-"""A pair with brightness and contrast alike, of a pair, a mesh and displacements (n, 2) [mm]."""
+"""From a pair, a mesh and displacements (n, 2) [mm] to a pair of equal brightness and contrast."""
 
 
 class StateObservation(Protocol):
-    """What is known of one state apart from force and strain; by default, nothing to share."""
+    """Data of one state apart from force and strain; by default, nothing is shared."""
 
     def prepare(self, level: Level, state: ModelState) -> None:
-        """Have the data of a level, weighted as the model's state asks for."""
+        """Prepare the data of a level, weighted as the model's state requires."""
         return
 
     def weigh_by_reference(self) -> None:
-        """Let slopes weigh the residual whose noise has nothing to do with its own."""
+        """Weigh the residual by slopes whose noise is independent of the residual's."""
         return
 
     def equations(self, state: ModelState) -> StateEquations:
-        """The share of the normal equations at the model's state."""
+        """The contribution to the normal equations at the model's state."""
 
     def shared(self, state: ModelState, other: ModelState) -> FloatArray:
-        """(k, k) products of slopes of this state and of another one in the same reference."""
+        """(k, k) products of the slopes of this state and of another one in the same reference."""
         return np.zeros((len(state.displacement_by),) * 2)
 
 
 class ImageData:
     """A pair of images of a state, compared on the pixels that the model's mesh covers.
 
-    pixels : of the model's mesh where it is at first.
-    noise : of the two; by default that of the reference there, estimated, in both.
-    light : what makes g(x + u) as bright as f, before each level; None for images of one light.
-    lens : that both were taken through. Points are put where it shows them: in resampled images
-        noise and slopes would hang together.
+    pixels : pixels of the model's initial mesh.
+    noise : noise of the two; by default estimated from the reference there, equal in both.
+    light : makes g(x + u) as bright as f, before each level; None for images of one brightness.
+    lens : lens that both were taken through. Points are mapped to where it shows them: in resampled
+        images, noise and slopes would be correlated.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class ImageData:
         self.pair = replace(self._given, mask=covered & self._given.masks[0])
 
     def prepare(self, level: Level, state: ModelState) -> None:
-        """Images of a level; on a coarse one what the residual is weighs it, not its noise."""
+        """Prepare images of a level; coarse ones are weighted by the residual, not by noise."""
         state = self._shown(state)
         if not np.array_equal(state.mesh.nodes, self.pixels.mesh.nodes):
             self._sort(MeshPixels(state.mesh))
@@ -129,7 +129,7 @@ class ImageData:
         if self._light is not None:
             pair = self._light(pair, mesh, state.displacement)
             light = float(np.std(pair.deformed) / np.std(self.pair.deformed))
-        if level == FULL:  # beyond the material that the model shows there, g is continued
+        if level == FULL:  # beyond the material that the model predicts there, g is continued
             moved = replace(mesh, nodes=mesh.nodes + state.displacement)
             shown = eroded(_covered(moved, pair.grid, 1), 1)
             pair = replace(pair, deformed_mask=pair.masks[1] & shown)
@@ -149,12 +149,12 @@ class ImageData:
         if nodal.pixels == 0:
             raise InputError("expected pixels of the model's mesh in both images, got none")
         if level != FULL:
-            # Blurred pixels are alike: as many count as there are independent ones.
+            # Blurred pixels are correlated: as many count as there are independent ones.
             self._expected = nodal.rms
             self._weight = 1.0 / (nodal.rms**2 * max(1.0, 4.0 * np.pi * level.blur**2))
 
     def _by_noise(self, pair: ImagePair, state: ModelState, light: float) -> None:
-        """Slopes of the reference, and weights by the noise of both images."""
+        """Compute slopes of the reference, and weights by the noise of both images."""
         px, u, own = pair.grid.pixel_size, displacement_at(state, self.pixels.mesh.nodes), self._own
         spline = continued_spline(pair.reference, pair.masks[0], self.order)
         _, d_row, d_col = spline.sample(own.row, own.col)
@@ -166,7 +166,7 @@ class ImageData:
         slopes = float(np.mean(d_row**2 + d_col**2))
         share = min(2.0 * f * slope_noise(self.order, 0.0) / max(slopes, _TINY), _MOST_NOISE)
         self._expected = float(np.sqrt(f + g * transfer.value))
-        # The slopes' noise meets g's alone: times its own f's makes nothing of smooth fields.
+        # The slopes' noise meets g's alone: its product with f's averages out in smooth fields.
         self._gain = 1.0 - share
         noise = self._gain * f + g * (transfer.density * self._gain + transfer.value * share)
         self._weight = self._gain / noise
@@ -175,13 +175,13 @@ class ImageData:
     def weigh_by_reference(self) -> None:
         """Let the reference's slopes, pushed forward, weigh the residual in place of g's.
 
-        Between pixels the noise of g varies less, and its slope says where: the mean of their
-        product is not 0 but half the slope of the variance, which biases what fits best.
+        Between pixels the noise of g has less variance; so the mean of its product with its slope
+        is not 0 but half the slope of the variance, which biases the best fit.
         """
         self._own = self._own._replace(slope=self._slope)
 
     def _shown(self, state: ModelState) -> ModelState:
-        """A state as the lens shows it."""
+        """Map a state to what the lens shows of it."""
         if self._lens is None:
             return state
         X, grid = state.mesh.nodes, self._given.grid
@@ -203,7 +203,7 @@ class ImageData:
         return normal_equations(self._own, mesh, self._images, displacement_at(state, mesh.nodes))
 
     def equations(self, state: ModelState) -> StateEquations:
-        """Projected from those of the nodes' displacements."""
+        """Project the normal equations of the nodes' displacements on the unknowns."""
         state = self._shown(state)
         nodal, cells, by = self._nodal(state), self.pixels.mesh.cells, state.displacement_by
         blocks = np.zeros((self.block.max() + 1, len(by)))
@@ -218,7 +218,7 @@ class ImageData:
         )  # fmt: skip
 
     def shared(self, state: ModelState, other: ModelState) -> FloatArray:
-        """(k, k) sums of the slopes along a state's fields times those along them in another."""
+        """(k, k) sums of products of the slopes along a state's fields and along another's."""
         state, other = self._shown(state), self._shown(other)
         pulled = self._deformation(state) @ np.linalg.inv(self._deformation(other))  # slopes: F^-T
         squares = np.einsum("mijab,mjl->milab", _square(self._nodal(state)), pulled)
@@ -233,7 +233,7 @@ class ImageData:
         return found
 
     def _in_deformed(self, state: ModelState) -> FloatArray:
-        """(2, p) row and column in the deformed image of the pixels compared [px]."""
+        """(2, p) row and column of the compared pixels in the deformed image [px]."""
         own, mesh, px = self._own, self.pixels.mesh, self._images.grid.pixel_size
         element = np.repeat(np.arange(len(mesh.cells)), np.diff(own.start))
         N = shape_functions("T6", own.xi.T.astype(np.float64))
@@ -242,9 +242,9 @@ class ImageData:
 
 
 class FieldData(StateObservation):
-    """Displacements of a state at points, by any code.
+    """Displacements of a state at points, measured by any code.
 
-    points, u : (p, 2) in the reference's frame [mm]; points beside the mesh are left out.
+    points, u : (p, 2) in the reference's frame [mm]; points outside the mesh are left out.
     sd : standard deviation of each component [mm], one for all or (p, 2).
     """
 
@@ -267,7 +267,7 @@ class FieldData(StateObservation):
         self._N = shape_functions(mesh.element, xi)
 
     def equations(self, state: ModelState) -> StateEquations:
-        """By differences of displacements at the points."""
+        """Equations from the differences of displacements at the points."""
         if not np.array_equal(state.mesh.nodes, self._mesh.nodes):
             self._sort(state.mesh)
         left = self._u - np.einsum("pa,pai->pi", self._N, state.displacement[self._nodes])
@@ -283,20 +283,20 @@ class FieldData(StateObservation):
 
 
 PLACE = ("centre_x", "centre_y", "orientation")
-"""Unknowns of where the reference shows the specimen: its middle [mm], about which it is turned
+"""Unknowns of the specimen's position in the reference: its centre [mm], and its rotation about it
 [rad]."""
 MOTION = ("shift_x", "shift_y", "turn")
-"""Unknowns of the camera's frame in each state: a shift [mm], and a turn about the origin [rad]."""
+"""Unknowns of the camera's frame in each state: shift [mm], rotation about the origin [rad]."""
 
 
 def imaged(
     state: ModelState, place: FloatArray | None, motions: FloatArray, number: int
 ) -> ModelState:
-    """A state as a camera sees it: put where the reference shows it, by a camera that has moved.
+    """Map a state to what a camera sees: at its place in the reference, by a camera that moved.
 
     place : (3,) in the order of PLACE; None for a specimen in the middle.
     motions : (count, 3) of all states in the order of MOTION; (0, 3) for a camera at rest.
-    number : of this state. Derivatives by place and motions are put behind the model's own, and are
+    number : index of this state. Derivatives by place and motions follow the model's own, and are
         zero for motions of other states.
     """
     mesh, X_by = state.mesh, state.nodes_by
@@ -321,9 +321,9 @@ def imaged(
 def rigidly_moved(
     points: FloatArray, by: FloatArray, motion: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 2) turned about the origin, then shifted; their derivatives (k + 3, n, 2).
+    """Rotate points (n, 2) about the origin, then shift them; and their derivatives (k + 3, n, 2).
 
-    by : (k, n, 2) of the points by parameters, behind which those by the motion are put.
+    by : (k, n, 2) derivatives of points by parameters, followed in the result by those by motion.
     motion : (3,) shift along x and y [mm] and turn [rad].
     """
     c, s = np.cos(motion[2]), np.sin(motion[2])
@@ -333,7 +333,7 @@ def rigidly_moved(
 
 
 def _covered(mesh: Mesh, grid: PixelGrid, edge_px: int) -> BoolArray:
-    """(rows, cols) pixels on a mesh, and not so close to an edge beyond the image's border."""
+    """(rows, cols) pixels on a mesh, away from its edges that lie beyond the image's border."""
     w, px = edge_px, grid.pixel_size
     wider = PixelGrid(grid.rows + 2 * w, grid.cols + 2 * w, px, grid.x0 - w * px, grid.y0 + w * px)
     found = locate(mesh.nodes, mesh.cells, mesh.element, wider, "mesh of the model").mask
@@ -345,7 +345,7 @@ def _covered(mesh: Mesh, grid: PixelGrid, edge_px: int) -> BoolArray:
 def through_lens(
     points: FloatArray, lens: Distortion, grid: PixelGrid
 ) -> tuple[FloatArray, FloatArray]:
-    """Where a lens shows points (n, 2) [mm], and the derivatives of that (n, 2, 2)."""
+    """Where a lens shows points (n, 2) [mm], and the derivatives of this mapping (n, 2, 2)."""
     at = grid.to_px(*points.T)
     (rr, rc), (cr, cc) = lens.gradient(*at)
     shown = np.column_stack(grid.to_mm(*lens.observed(*at)))
@@ -353,14 +353,14 @@ def through_lens(
 
 
 def displacement_at(state: ModelState, nodes: FloatArray) -> FloatArray:
-    """(n, 2) a state's displacement where the nodes of another mesh are, continued into holes."""
+    """(n, 2) a state's displacement at the nodes of another mesh, continued into holes."""
     if np.array_equal(state.mesh.nodes, nodes):
         return state.displacement
     return nodal_values(state.mesh, state.displacement, nodes, beside=True)
 
 
 def at_fixed_points(state: ModelState) -> ModelState:
-    """A state whose derivatives are those of u at points of the material where nodes are now."""
+    """A state with the derivatives of u at the points of the material where nodes are now."""
     if not state.nodes_by.any():
         return state
     slopes = nodal_gradient(state.mesh, state.displacement)
@@ -375,14 +375,14 @@ def _square(nodal: NodalEquations) -> FloatArray:
 
 
 def _chunks(by: FloatArray, cells: IntArray) -> Iterator[tuple[slice, FloatArray]]:
-    """Some elements at a time, with fields (k, n, 2) at their nodes (m, 12, k): all are large."""
+    """Some elements at a time, with fields (k, n, 2) at their nodes (m, 12, k): to save memory."""
     for first in range(0, len(cells), _CHUNK):
         some = slice(first, first + _CHUNK)
         yield some, np.moveaxis(by[:, cells[some]], 0, -1).reshape(-1, 12, len(by))
 
 
 def _products(by: FloatArray, cells: IntArray, blocks: FloatArray) -> FloatArray:
-    """(k, k) sums over elements of fields (k, n, 2) before and behind blocks."""
+    """(k, k) sums over elements of fields (k, n, 2) times blocks times fields."""
     matrix = np.zeros((len(by), len(by)))
     for some, S in _chunks(by, cells):
         B = np.einsum("mijab->maibj", blocks[some]).reshape(-1, 12, 12)
@@ -391,7 +391,7 @@ def _products(by: FloatArray, cells: IntArray, blocks: FloatArray) -> FloatArray
 
 
 def _blocks(mesh: Mesh) -> IntArray:
-    """(m,) number of the part of the body that each element is in."""
+    """(m,) number of the part of the body in which each element lies."""
     middle = mesh.nodes[mesh.cells].mean(axis=1) - mesh.nodes.min(axis=0)
     size = np.ptp(mesh.nodes[:, 0]) / _ALONG
     place = np.floor(middle / size).astype(np.int64)
