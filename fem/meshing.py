@@ -345,14 +345,14 @@ def mesh_boundaries(
         return _current_block()
 
 
-_LEAST_ELEMENTS = 8
-"""Around a loop."""
+_LEAST_ELEMENTS, _ELEMENTS = 8, 32
+"""Around a loop; the latter unless sides would be shorter than two thirds of the given size."""
 
 
 def _add_loop(loop: Collection[FloatArray], size: float) -> int:
     geo = gmsh.model.geo
     lengths = [float(np.linalg.norm(np.diff(c, axis=0), axis=1).sum()) for c in loop]
-    size = min(size, sum(lengths) / _LEAST_ELEMENTS)
+    size = min(size, max(sum(lengths) / _ELEMENTS, size / 1.5), sum(lengths) / _LEAST_ELEMENTS)
     begins = [geo.addPoint(*curve[0], 0.0) for curve in loop]
     curves = []
     for k, (curve, length) in enumerate(zip(loop, lengths, strict=True)):

@@ -78,23 +78,27 @@ def test_error_bars_are_large_where_there_is_no_speckle() -> None:
         return 1.0 - 1.0 / ((1.0 + np.exp((0.5 - x) / 0.03)) * (1.0 + np.exp((0.2 - y) / 0.03)))
 
     pair, at = plate_pair(wavy_field), np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
-    images, random = [], np.random.default_rng(0)
-    for image, mask, points in zip((pair.reference, pair.deformed), pair.masks,
-                                   (at, inverted(wavy_field, at, 1e-9)), strict=True):  # fmt: skip
-        grey = float(image[mask].mean())
-        faded = np.where(mask, grey + fading(points) * (image - grey), 0.0)
-        images.append(faded + 0.01 * random.standard_normal(GRID.shape))
-    result = measure_displacement(pair.with_images(*images), at_rest, options=COARSE)
-    assert "shows no speckle" in result.warnings[0]
-    sd = result.standard_deviation_on()[pair.masks[0]] / GRID.pixel_size
-    error, (x, y) = abs(error_px(pair, result)), at[pair.masks[0]].T
+    x, y = at[pair.masks[0]].T
     blank = (x > 0.65) & (y > 0.35)
     full = (x < 0.4) | (y < 0.1)
-    assert np.median(sd[blank]) > 10.0 * np.median(sd[full])
-    # Of what can't be seen it is a guess, but never a number that looks good.
-    assert np.sqrt(np.mean(error[blank] ** 2)) > 10.0 * np.sqrt(np.mean(error[full] ** 2))
-    assert np.mean(error[blank] < 3.0 * sd[blank]) > 0.7
-    assert np.mean(error[full] < 1.96 * sd[full]) > 0.9
+    came_from, within = inverted(wavy_field, at, 1e-9), []
+    for seed in range(3):
+        images, random = [], np.random.default_rng(seed)
+        for image, mask, points in zip((pair.reference, pair.deformed), pair.masks,
+                                       (at, came_from), strict=True):  # fmt: skip
+            grey = float(image[mask].mean())
+            faded = np.where(mask, grey + fading(points) * (image - grey), 0.0)
+            images.append(faded + 0.01 * random.standard_normal(GRID.shape))
+        result = measure_displacement(pair.with_images(*images), at_rest, options=COARSE)
+        assert "shows no speckle" in result.warnings[0]
+        sd = result.standard_deviation_on()[pair.masks[0]] / GRID.pixel_size
+        error = abs(error_px(pair, result))
+        assert np.median(sd[blank]) > 10.0 * np.median(sd[full])
+        # Of what can't be seen it is a guess, but never a number that looks good.
+        assert np.sqrt(np.mean(error[blank] ** 2)) > 10.0 * np.sqrt(np.mean(error[full] ** 2))
+        within.append(np.mean(error[blank] < 3.0 * sd[blank]))
+        assert np.mean(error[full] < 1.96 * sd[full]) > 0.9
+    assert np.mean(within) > 0.7  # one guess has 60 to 96 %
 
 
 def test_start_that_is_right_stays() -> None:

@@ -48,7 +48,7 @@ _PROBES, _DEGREES = 4, 1.4
 _STEP = 1.4
 """Between neighbouring cut-off wavelengths."""
 _TINY = float(np.finfo(np.float64).tiny)
-_LEAST_PX, _MOST_PX = 6.0, 400.0
+_LEAST_PX, _MOST_PX = 10.0, 400.0
 """Shorter ones leave single nodes to what splines make of edges."""
 _STRONGER = 4.0
 """Weight of the regularisation that shows its bias, over the weight used [-]."""
@@ -95,9 +95,9 @@ def least_risk(
     while True:
         best = min(tried, key=lambda k: tried[k].value)
         missing = [k for k in (best - 1, best + 1) if k not in tried]
-        if not missing or not _LEAST_PX < tried[best].cutoff_px < _MOST_PX:
+        if not missing or not _LEAST_PX < tried[best].cutoff_px / 1.05 < _MOST_PX:
             return tuple(tried[k] for k in sorted(tried))
-        cutoff = first_px * _STEP ** missing[0]
+        cutoff = max(first_px * _STEP ** missing[0], min(first_px, _LEAST_PX))
         tried[missing[0]] = risk(at, cutoff, pixel_size, excess)
 
 
@@ -106,9 +106,9 @@ def best_of(tried: tuple[Risk, ...]) -> float:
     k = min(range(len(tried)), key=lambda i: tried[i].value)
     if not 0 < k < len(tried) - 1:
         return max(tried[k].cutoff_px, _LEAST_PX)
-    low, here, high = (tried[i].value for i in (k - 1, k, k + 1))
-    shift = 0.5 * (low - high) / (low - 2.0 * here + high)
-    return max(float(tried[k].cutoff_px * _STEP**shift), _LEAST_PX)
+    three = tried[k - 1 : k + 2]
+    a, b, _ = np.polyfit(np.log([t.cutoff_px for t in three]), [t.value for t in three], 2)
+    return max(float(np.exp(-0.5 * b / a)), _LEAST_PX)
 
 
 class Deviations(NamedTuple):

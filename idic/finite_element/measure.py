@@ -275,7 +275,8 @@ class _Measurement:
             signal, gain = sums.signal(on.slope_noise * pushed)
             blocks = (gain * signal[:, None, None, None]) ** 2 * sums.blocks
             M = body.matrix(blocks)
-            ratio = body.energies(M) / body.energies(R)
+            rough = body.roughness if R is body.smoothness else body.energies(R)
+            ratio = body.energies(M) / rough
         else:
             blocks, M, ratio = kept.sums.blocks, kept.M, kept.ratio
             signal, gain = kept.signal, kept.gain

@@ -184,6 +184,7 @@ class Body:
         self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=2)))
         """Of waves along x and y, of both components, that compare data and smoothness [mm]."""
         self._waves = np.kron(np.cos(2.0 * np.pi / self.wavelength * mesh.nodes), np.eye(2))
+        self.roughness = self.energies(self.smoothness)
         self._factor: Factor | None = None
         self._factorised: tuple[csr_array, csr_array, float] | None = None
         self._stored, self.library = 0, ""  # entries of what is factorised, and what does it
@@ -226,7 +227,7 @@ class Body:
         if not R.data.any():  # a single element
             return u
         weight = (cutoff / self.wavelength) ** Smoothness.power * self.energies(one)
-        return self.factor(one, R, weight / self.energies(R)).solve(one @ u.ravel()).reshape(-1, 2)
+        return self.factor(one, R, weight / self.roughness).solve(one @ u.ravel()).reshape(-1, 2)
 
     def samples(self, M: FloatArray, pull: FloatArray, free: FloatArray) -> tuple[FloatArray, ...]:
         """(2 n, SAMPLES) random vectors of the covariance M (m, 3, 6, 6), times (n,) >= 1.
