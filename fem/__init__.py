@@ -1,12 +1,12 @@
 """Finite elements: specimens and lattices, their equilibrium, stability and buckled branches.
 
 ``field``, ``specimen``, ``materials`` and ``experiment`` are plain numpy; everything else needs
-dolfinx. The whole of it for a specimen::
+dolfinx. A complete simulation of a specimen::
 
     from modeharvest.fem.experiment import Experiment
     from modeharvest.fem.simulate import simulate
     solution = simulate(Experiment(strains=(0.078, 0.128)))
 
 ``path`` follows a specimen through buckling, ``lattice`` has periodic cells of infinite
-lattices, ``bloch`` their waves of any length.
+lattices, ``bloch`` computes their Bloch waves.
 """

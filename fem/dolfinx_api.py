@@ -1,4 +1,4 @@
-"""What differs between the supported dolfinx versions (0.9 to 0.11), and nothing else."""
+"""Functions that differ between the supported dolfinx versions (0.9 to 0.11)."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if tuple(int(v) for v in VERSION.split(".")[:2]) < (0, 9):
         f"expected dolfinx 0.9 or newer, got {VERSION}; see 'Install' in the README"
     )
 
-# dolfinx numbers a mid-side node by the corner opposite to it, VTK and gmsh in a round.
+# dolfinx orders mid-side nodes by the opposite corner, VTK and gmsh counter-clockwise.
 _T6_FROM_VTK = [0, 1, 2, 4, 5, 3]
 
 
 def create_mesh(mesh: Mesh, comm: MPI.Comm) -> dolfinx.mesh.Mesh:
-    """Distribute a T6 mesh (of rank 0, ignored elsewhere) over the communicator.
+    """Distribute a T6 mesh (given on rank 0, ignored elsewhere) over the communicator.
 
-    The body is cut in halves by the cells' places until every rank has its part, which takes less
-    time than a partitioner of graphs.
+    The body is repeatedly bisected by the cells' positions until every rank has its part, which is
+    faster than graph partitioning.
     """
     if comm.rank == 0:
         nodes, cells = mesh.nodes, mesh.cells[:, _T6_FROM_VTK]
@@ -42,7 +42,7 @@ def create_mesh(mesh: Mesh, comm: MPI.Comm) -> dolfinx.mesh.Mesh:
     def parts(_comm: Any, count: int, *_cells: Any) -> Any:
         ranks = _bisected(nodes[cells[:, :3]].mean(axis=1), 0, count)
         found = dolfinx.graph.adjacencylist(ranks[:, None])
-        return getattr(found, "_cpp_object", found)  # 0.10 wraps it
+        return getattr(found, "_cpp_object", found)  # wrapped in 0.10
 
     element = basix.ufl.element("Lagrange", "triangle", 2, shape=(2,))
     partitioner = parts if comm.size > 1 else None
@@ -50,7 +50,7 @@ def create_mesh(mesh: Mesh, comm: MPI.Comm) -> dolfinx.mesh.Mesh:
 
 
 def _bisected(points: NDArray[np.float64], first: int, count: int) -> NDArray[np.int32]:
-    """To which of ``count`` parts, numbered from ``first``, each point belongs: cut across."""
+    """(n,) number of each point's part, from ``first``: recursive bisection in ``count`` parts."""
     part = np.full(len(points), first, dtype=np.int32)
     if count > 1 and len(points):
         order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))], kind="stable")
@@ -73,10 +73,10 @@ def assemble_matrix(form: Any, bcs: list[Any], diagonal: float, matrix: Any = No
 
 
 def create_symmetric_matrix(V: Any) -> PETSc.Mat:
-    """An empty PETSc matrix of this rank's cells alone, over all components of ``V`` that it has.
+    """An empty PETSc matrix for this rank's cells alone, over all its components of ``V``.
 
-    It keeps its upper triangle only, in blocks of two components. Assembling into it takes half the
-    time: the lower halves of elements' matrices are left out, a place is looked for once a block.
+    It stores only the upper triangle, in blocks of two components. Assembly takes half the time:
+    the lower halves of element matrices are omitted, and there is one look-up per block.
     """
     cells, nodes = V.dofmap.list, V.dofmap.index_map
     count = nodes.size_local + nodes.num_ghosts
@@ -95,7 +95,7 @@ def create_symmetric_matrix(V: Any) -> PETSc.Mat:
 
 
 def shared_nodes(V: Any) -> NDArray[np.int64]:
-    """Local numbers of the nodes of this rank's cells that other ranks' cells have, too."""
+    """Local numbers of nodes that this rank's cells share with those of other ranks."""
     ghosts = dolfinx.fem.Function(V).x
     ghosts.array[2 * V.dofmap.index_map.size_local :] = 1.0
     ghosts.petsc_vec.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
@@ -103,7 +103,7 @@ def shared_nodes(V: Any) -> NDArray[np.int64]:
 
 
 def assemble_vector(form: Any, vector: PETSc.Vec) -> None:
-    """Assemble a linear form into ``vector`` and add the ghosts' shares to their owners."""
+    """Assemble a linear form into ``vector`` and add ghost contributions to their owners."""
     with vector.localForm() as local:
         local.set(0.0)
     dolfinx_petsc.assemble_vector(vector, form)
@@ -113,8 +113,8 @@ def assemble_vector(form: Any, vector: PETSc.Vec) -> None:
 def gather_nodes(V: Any, values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Nodal values (count, 2) in the order of the nodes given to :func:`create_mesh`.
 
-    ``values`` is the local array of a function of the vector space ``V`` (quadratic, as the
-    geometry). Every rank gets the whole array.
+    ``values``: local array of a function in the vector space ``V`` (quadratic, like the geometry).
+    Every rank receives the whole array.
     """
     geometry = V.mesh.geometry  # "dofmap" became "dofmaps", one for each cell type, in 0.10
     dofmap = geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap

@@ -1,4 +1,4 @@
-"""What a virtual compression test is: plain dataclasses, no dolfinx."""
+"""Description of a virtual compression test: plain dataclasses, no dolfinx."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from modeharvest.util.errors import InputError, require_within
 EDGES = ("clamped", "sliding")
 BRANCHES = ("primary", "buckled+", "buckled-")
 SMALLEST_STEP = 1e-5
-"""Of a path [-]: with less it would never end."""
+"""Smallest step along a path [-]; smaller steps would take forever."""
 _LARGEST_TILT = 1.0
 
 
 def require_edges(edges: str) -> None:
-    """Raise InputError unless loaded edges are of a known kind."""
+    """Raise InputError unless ``edges`` is a known kind of loaded edges."""
     if edges not in EDGES:
         raise InputError(f"edges: expected {' or '.join(map(repr, EDGES))}, got {edges!r}")
 
 
 @dataclass(frozen=True)
 class PathOptions:
-    """How the path is followed."""
+    """Options of following the equilibrium path."""
 
     first_step: float = 0.04
     largest_step: float = 0.04
     """First and largest step of nominal strain along the primary path [-]."""
     critical_tolerance: float = 1e-7
-    """To which the critical strain is located [-]."""
+    """Tolerance of the critical strain [-]."""
     first_amplitude: float = 0.08
-    """Largest nodal displacement of the first step onto the branch, as a share of the pitch or
-    whatever length the branch is given [-]."""
+    """Largest nodal displacement of the first step onto the branch, relative to the pitch or
+    another given length [-]."""
     growth: float = 2.0
-    """Most by which the mode's amplitude may grow in one step along the branch [-]."""
+    """Largest factor by which the mode's amplitude may grow in one step along the branch [-]."""
 
     def __post_init__(self) -> None:
         what, tolerance = "path options: expected a", self.critical_tolerance
@@ -59,21 +59,21 @@ class Experiment:
     mesh_size: float = 0.2
     """Target edge length of the T6 elements [mm]."""
     edges: str = "clamped"
-    """Loaded edges "clamped" or "sliding"."""
+    """Kind of loaded edges: "clamped" or "sliding"."""
     branches: tuple[str, ...] = ("buckled+",)
-    """What to keep above the critical strain, out of "primary" (unstable there), "buckled+" and
+    """Branches to keep above the critical strain: "primary" (unstable there), "buckled+" and
     "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any)."""
     imperfection: Imperfection = field(default_factory=Imperfection)
-    """Scatter of the holes; with any, there is no bifurcation but one natural path."""
+    """Scatter of the holes; with scatter there is no bifurcation but one natural path."""
     path: PathOptions = field(default_factory=PathOptions)
     """How the equilibrium path is followed."""
     tilt: float = 0.0
-    """By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise about
-    its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is not quite
+    """Rotation of the loaded edge at x > 0 per nominal strain [rad], counter-clockwise about its
+    middle: at the strain e, -e tilt y is added to its u_x. This models a stage that is not quite
     parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed."""
     guided: bool = False
-    """Fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail would;
-    ``holes_y`` has to be even, rows not staggered. Keeps long specimens from bowing."""
+    """Fix u_y at the solid junctions on the line of mid-height, like pins in a straight rail;
+    ``holes_y`` must be even, rows not staggered. Prevents long specimens from bowing."""
 
     def __post_init__(self) -> None:
         strains = self.strains
@@ -99,13 +99,13 @@ class Experiment:
 
     @property
     def is_perfect(self) -> bool:
-        """Whether specimen and loading keep their symmetries, so that there is a bifurcation."""
+        """Whether there is neither scatter nor tilt, so that a bifurcation is possible."""
         return self.imperfection.is_none and self.tilt == 0.0
 
     def described(self) -> dict[str, dict[str, Any]]:
-        """What is tested, in a solution's ``info``: specimen, material, loading, imperfection.
+        """Specimen, material, loading and imperfection, for a solution's ``info``.
 
-        As JSON gives it back; the rest of the options says how the solution is found.
+        Values are as JSON returns them. The other options say how the solution is found.
         """
         loading = {"edges": self.edges, "length_mm": self.specimen.length}
         tables = {

@@ -1,6 +1,6 @@
-"""A mesh, nodal displacements on it, and how they came about: plain numpy, no dolfinx.
+"""A mesh, nodal displacements on it, and their origin: plain numpy, no dolfinx.
 
-What finite elements hand to everything else. The file is HDF5, readable with h5py alone::
+The result of a finite-element simulation. The file is HDF5, readable with h5py alone::
 
     nodes (n, 2) [mm]    cells (m, k)    @format @element @info (JSON: what was simulated)
     snapshots/0000/displacement (n, 2) [mm]    @nominal_strain @branch ...
@@ -31,9 +31,9 @@ T = TypeVar("T")
 
 FORMAT = "modeharvest-solution-1"
 COMPRESSED = {"compression": 1, "shuffle": True}
-"""Of datasets in HDF5: more takes twice as long, for a hundredth less of measured displacements."""
+"""Compression of HDF5 datasets: higher levels take twice as long and save 1 % of measured u."""
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
-_FLAT = 1e-6  # of a plane mesh's size: what its z may differ by
+_FLAT = 1e-6  # largest variation of z in a plane mesh, relative to its size
 MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
 
 
@@ -44,7 +44,7 @@ class Mesh:
     nodes: FloatArray
     """(n, 2) positions [mm]."""
     cells: IntArray
-    """(m, k) node numbers in the module's order."""
+    """(m, k) node numbers of each cell, ordered as in the module's docstring."""
     element: str
 
     def __post_init__(self) -> None:
@@ -73,14 +73,14 @@ def with_mid_sides(nodes: FloatArray, cells: IntArray) -> tuple[FloatArray, IntA
 
 
 def boundary_sides(mesh: Mesh) -> IntArray:
-    """(s, 3) first corner, mid-side and second corner of the sides that only one cell has.
+    """(s, 3) first corner, mid-side and second corner of the sides that belong to one cell only.
 
-    The material lies to their left; without mid-side nodes the second column repeats the first.
+    The material is to the left of them; without mid-side nodes the second column repeats the first.
     """
     k = np.arange(3 if mesh.element in ("T3", "T6") else 4)
     middle = k + k.size if mesh.cells.shape[1] > k.size else k
     every = mesh.cells[:, np.stack([k, middle, np.roll(k, -1)], axis=1)]
-    every = every.swapaxes(0, 1).reshape(-1, 3)  # side by side
+    every = every.swapaxes(0, 1).reshape(-1, 3)  # a row for each side of each cell
     pairs = np.sort(every[:, [0, 2]], axis=1)
     _, number, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
     return np.asarray(every[count[number.ravel()] == 1])
@@ -93,31 +93,31 @@ class Snapshot:
     nominal_strain: float
     """Applied shortening over L, the length of the cellular part [-]."""
     displacement: FloatArray
-    """(n, 2) at the mesh's nodes [mm]."""
+    """(n, 2) displacement of the mesh's nodes [mm]."""
     reaction: float = float("nan")
-    """Compressive force on the loaded edge, by thickness [N/mm]."""
+    """Compressive force on the loaded edge per unit thickness [N/mm]."""
     energy: float = float("nan")
-    """Stored energy by thickness [N]."""
+    """Stored energy per unit thickness [N]."""
     negative_pivots: int | None = None
-    """Negative eigenvalues of the tangent stiffness; 0: stable, None: unknown."""
+    """Number of negative eigenvalues of the tangent stiffness; 0: stable, None: unknown."""
     eigenvalues: tuple[float, ...] = ()
-    """Lowest ones of K x = lambda M x, ascending [N/mm^4], where they were computed; M is the mass
-    matrix of unit density."""
+    """Lowest eigenvalues of K x = lambda M x, ascending [N/mm^4], if computed; M is the mass matrix
+    of unit density."""
     branch: str = "primary"
     """Either "primary", "buckled+" or "buckled-"."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A mesh and its snapshots, with everything needed to make them again."""
+    """A mesh and its snapshots, with everything needed to reproduce them."""
 
     mesh: Mesh
     """The undeformed specimen."""
     snapshots: tuple[Snapshot, ...]
-    """Its equilibrium states."""
+    """Equilibrium states of the specimen."""
     info: Mapping[str, Any] = field(default_factory=dict)
-    """Plain JSON values: geometry, material, loading, versions, seed, the critical strain and what
-    the path cost."""
+    """Plain JSON values: geometry, material, loading, versions, seed, critical strain and the
+    computational cost of the path."""
 
     def __post_init__(self) -> None:
         if not len(self.mesh.cells):
@@ -135,7 +135,7 @@ class Solution:
 
     @property
     def specimen(self) -> Specimen:
-        """The specimen that was simulated; InputError for a solution of another solver."""
+        """The simulated specimen; InputError for a solution of another solver."""
         if "specimen" not in self.info:
             raise InputError(
                 "expected a solution that says of which specimen it is, got one that does not "
@@ -144,7 +144,7 @@ class Solution:
         return made(Specimen, self.info["specimen"])
 
     def at(self, nominal_strain: float) -> Snapshot:
-        """The stable snapshot at a nominal strain, the first if several; InputError without one."""
+        """The snapshot at a nominal strain, a stable one if available; InputError if none."""
         found = [s for s in self.snapshots if abs(s.nominal_strain - nominal_strain) < 1e-9]
         if not found:
             have = ", ".join(f"{s.nominal_strain:.4f}" for s in self.snapshots) or "none"
@@ -164,7 +164,7 @@ class Solution:
 
     @classmethod
     def read(cls, path: Path | str) -> Solution:
-        """Read what :meth:`write` wrote; an InputError refuses any other file."""
+        """Read a file of :meth:`write`; InputError for any other file."""
         remedy = "make it again with 'modeharvest fem'"
         with open_hdf5(path, "a solution (HDF5)", remedy, FORMAT) as file:
             mesh = read_mesh(file)
@@ -183,9 +183,9 @@ class Solution:
 
 
 def in_space(mesh: Mesh, fields: Mapping[str, FloatArray | FloatImage]) -> meshio.Mesh:
-    """A mesh with nodal fields by name, all in three dimensions: VTK knows no plane.
+    """A mesh with nodal fields by name, padded to three dimensions as VTK requires.
 
-    Scalars are (n,), vectors (n, 2), tensors (n, 2, 2), whose nine components become one row.
+    Scalars are (n,), vectors (n, 2), tensors (n, 2, 2); a tensor's nine components become one row.
     """
 
     def padded(values: FloatArray | FloatImage) -> Any:
@@ -198,19 +198,19 @@ def in_space(mesh: Mesh, fields: Mapping[str, FloatArray | FloatImage]) -> meshi
 
 
 def write_mesh(file: h5py.File, mesh: Mesh) -> None:
-    """Into an HDF5 file: datasets nodes and cells, attribute element."""
+    """Write a mesh into an HDF5 file: datasets nodes and cells, attribute element."""
     file.attrs["element"] = mesh.element
     file.create_dataset("nodes", data=mesh.nodes, **COMPRESSED)
     file.create_dataset("cells", data=mesh.cells.astype(np.int32), **COMPRESSED)
 
 
 def read_mesh(file: h5py.File) -> Mesh:
-    """What :func:`write_mesh` wrote."""
+    """Read a mesh written by :func:`write_mesh`."""
     return Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
 
 
 def write_values(group: h5py.Group, record: Any) -> None:
-    """Into an HDF5 group: a dataclass' arrays as datasets, all else as attributes."""
+    """Write a dataclass into an HDF5 group: arrays as datasets, other values as attributes."""
     for name, value in vars(record).items():
         if isinstance(value, np.ndarray):
             group.create_dataset(name, data=value, **COMPRESSED)
@@ -219,7 +219,7 @@ def write_values(group: h5py.Group, record: Any) -> None:
 
 
 def read_values(group: h5py.Group, kind: type[T]) -> T:
-    """What :func:`write_values` wrote of a dataclass."""
+    """Read a dataclass written by :func:`write_values`."""
     found: dict[str, Any] = {}
     for name in (f.name for f in fields(kind)):  # type: ignore[arg-type]
         is_array = name in group
@@ -234,7 +234,7 @@ def _read_snapshot(group: h5py.Group) -> Snapshot:
 
 
 def read_any_mesh(path: Path | str) -> meshio.Mesh:
-    """Points, cells, named sets of these and nodal fields of a file that meshio reads."""
+    """Points, cells, named cell sets and nodal fields of a file in any format of meshio."""
     what, remedy = "a mesh that meshio reads", "export it again"
     found = read_in_child("mesh", path, what, remedy)
     with reading(path, what, remedy):
@@ -247,11 +247,11 @@ def read_any_mesh(path: Path | str) -> meshio.Mesh:
 
 
 def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> Solution:
-    """Take the mesh and displacement of any solver whose file meshio reads.
+    """Read mesh and displacement of any solver from a file in any format of meshio.
 
-    Cells are T3, T6, Q4, Q8 or Q9 in the x-y plane [mm], ``displacement`` is the name of a nodal
-    vector field [mm], ``nominal_strain`` that of the snapshot [-]. InputError if the file can't be
-    read, has no such cells or several types of them, or no such field.
+    Cells are T3, T6, Q4, Q8 or Q9 in the x-y plane [mm]; ``displacement``: name of a nodal vector
+    field [mm]; ``nominal_strain``: of the snapshot [-]. InputError if the file can't be read, or
+    has no such cells, several types of them, or no such field.
     """
     source = read_any_mesh(path)
     mesh = plane_mesh(source, path)
@@ -265,7 +265,7 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
 
 
 def plane_mesh(source: meshio.Mesh, path: Path | str) -> Mesh:
-    """The T3, T6, Q4, Q8 or Q9 mesh with z = const of a file that was read.
+    """The T3, T6, Q4, Q8 or Q9 mesh with z = const from a file's content.
 
     InputError if it has no such cells or several types of them, or isn't plane.
     """

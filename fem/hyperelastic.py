@@ -1,8 +1,8 @@
-"""The weak form of a hyperelastic body: what dolfinx assembles, for specimens and cells alike.
+"""The weak form of a hyperelastic body, assembled by dolfinx, for specimens and cells.
 
 Total Lagrangian, plane strain, six-node triangles with the three-point Gauss rule, as in the
-paper's section "Virtual Experiments"; or polynomials of a higher degree on them, with a rule to
-match. A material states its energy; the rest is derived.
+paper's section "Virtual Experiments"; or polynomials of a higher degree on the triangles, with a
+matching rule. Stress and stiffness are derived from the material's energy.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from modeharvest.util.errors import InputError
 _form = partial(
     dolfinx.fem.form, jit_options={"cffi_extra_compile_args": ["-O3", "-ffast-math", "-g0"]}
 )
-"""Compiles a form whose sums may be reordered: assembly takes two thirds of the time."""
+"""Compiles a form whose sums may be reordered; this reduces assembly to two thirds of the time."""
 _CORNERS_AND_MIDDLES = 0.5 * np.array([[0, 0], [2, 0], [0, 2], [1, 1], [0, 1], [1, 0]])
 
 
@@ -35,11 +35,11 @@ class Hyperelastic:
 
     ``V`` is the space and ``u`` the displacement [mm] at which everything is assembled;
     ``energy``, ``forces``, ``stiffness`` and ``mass`` (of unit density) are dolfinx forms. The
-    mesh is needed on rank 0 only; an InputError refuses other elements than T6.
+    mesh is needed on rank 0 only; InputError for other elements than T6.
 
-    parametric : whether ``constants`` has the material's as dolfinx Constants by their names, such
-        as "kappa" or "moduli[0]"; otherwise the forms are compiled with their values, and faster.
-    degree : of the displacement's polynomials over an element.
+    parametric : whether ``constants`` has the material's constants as dolfinx Constants by name,
+        such as "kappa" or "moduli[0]"; otherwise forms are compiled with fixed values, and faster.
+    degree : polynomial degree of the displacement over an element.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Hyperelastic:
         self._own_cells = np.arange(domain.topology.index_map(2).size_local, dtype=np.int32)
 
     def stiffness_along(self, direction: dolfinx.fem.Function) -> Any:
-        """The form of the stiffness times a displacement: how forces change along it."""
+        """The form of the stiffness times a displacement: change of the forces along it."""
         return _form(ufl.derivative(self._forces, self.u, direction))
 
     def sampled(self, points: FloatArray) -> csr_array:
-        """Matrix (m k, n) from V's nodes to points (k, 2) of m elements in order; on one rank."""
+        """Matrix (m k, n) from V's nodes to local points (k, 2) in all m elements; on one rank."""
         basis = self.V.element.basix_element.tabulate(0, points)[0, :, :, 0]  # (k, b)
         number = np.argsort(self.V.mesh.topology.original_cell_index)
         nodes = np.repeat(self.V.dofmap.list[number], len(basis), axis=0)  # (m k, b)
@@ -86,7 +86,7 @@ class Hyperelastic:
 
 
 def _with_constants(material: Material, domain: Any) -> tuple[Material, dict[str, Any]]:
-    """The same law with dolfinx Constants instead of its numbers, and those by their names."""
+    """The same law with dolfinx Constants instead of numbers, and these Constants by name."""
     constants: dict[str, Any] = {}
 
     def replaced(name: str, value: Any) -> Any:
@@ -95,16 +95,16 @@ def _with_constants(material: Material, domain: Any) -> tuple[Material, dict[str
         constants[name] = dolfinx.fem.Constant(domain, np.float64(value))
         return constants[name]
 
-    law = copy(material)  # whose own checks are of numbers
+    law = copy(material)  # without its checks, which are for numbers
     for name, value in vars(material).items():
         object.__setattr__(law, name, replaced(name, value))
     return law, constants
 
 
 class FreeBody:
-    """A body without any constraint, on one rank, of which periodic cells are made.
+    """A body without constraints, on one rank, used for periodic cells.
 
-    All is in the order of the mesh's nodes, the two components of a node side by side.
+    Arrays are in the order of the mesh's nodes, with the two components of a node adjacent.
     """
 
     def __init__(self, mesh: Mesh, material: Material) -> None:
@@ -113,7 +113,7 @@ class FreeBody:
         self._V = self._forms.V
         count = len(mesh.nodes)
         numbers = dolfinx_api.gather_nodes(self._V, np.arange(2 * count, dtype=np.float64), count)
-        # Position in dolfinx's order of every component in the order of the nodes.
+        # For each component in the order of the mesh's nodes: its position in dolfinx's order.
         self._order = np.rint(numbers).astype(np.int64).ravel()
         self._tangent: Any = None
         self._reordering: tuple[Any, ...] = ()
@@ -149,7 +149,7 @@ class FreeBody:
     def _reordered(self, matrix: Any) -> csr_array:
         indptr, indices, values = matrix.getValuesCSR()
         shape = (len(self._order),) * 2
-        if not self._reordering:  # all matrices of a body have one pattern
+        if not self._reordering:  # all matrices of a body have the same pattern
             place, numbers = np.argsort(self._order), np.arange(len(values))
             rows = np.repeat(place, np.diff(indptr))
             found = csr_array((numbers, (rows, place[indices])), shape)

@@ -1,10 +1,10 @@
-"""Compressible hyperelastic materials in plane strain: each states only its energy.
+"""Compressible hyperelastic materials in plane strain, each defined by its energy alone.
 
 UFL differentiates the energy W(F) to the first Piola-Kirchhoff stress P and the tangent, so
 a new material is one frozen dataclass with one method. F is the 2 x 2 in-plane deformation
-gradient; the stretch out of the plane is 1. UFL is imported where an energy is computed, so
-that constants can be stated and checked without it; where it isn't, an energy takes F as a matrix
-of jets, numbers with their first two derivatives, by :func:`stress_and_tangent`.
+gradient; the stretch out of the plane is 1. UFL is imported only where an energy is computed, so
+that constants can be given and checked without it. Without UFL, an energy is evaluated for F as a
+matrix of jets, numbers with their first two derivatives, by :func:`stress_and_tangent`.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class TwoTermI1:
 
 
 def functions_of(F: Any) -> Any:
-    """The functions det, inner, ln, sqrt, lt and conditional of F: UFL's, or those of jets."""
+    """Namespace of det, inner, ln, sqrt, lt, conditional for F: of UFL or of :class:`JetMatrix`."""
     if isinstance(F, JetMatrix):
         return JetMatrix
     import ufl
@@ -109,18 +109,18 @@ class Material(Protocol):
 
 
 MATERIALS: dict[str, type[Any]] = {"ogden": Ogden, "two-term-I1": TwoTermI1}
-"""By their kinds in a case."""
+"""Material classes by their ``kind`` in a case file."""
 
 
 def material_table(material: Any) -> dict[str, Any]:
-    """Kind (the class' name) and constants, as in solutions."""
+    """Kind (the class's name) and constants of a material, as stored in solutions."""
     return {"kind": type(material).__name__, **vars(material)}
 
 
 def material_of(table: Mapping[str, Any]) -> Material:
-    """The material of a table with its ``kind`` as in a case or as in a solution.
+    """The material of a table, with ``kind`` as in a case file or as in a solution.
 
-    An InputError refuses an unknown kind or constant, and one out of its range.
+    InputError for an unknown kind or constant, or a value out of range.
     """
     constants = dict(table)
     kinds = {**MATERIALS, **{kind.__name__: kind for kind in MATERIALS.values()}}
@@ -151,12 +151,12 @@ def power_sum_of_stretches(F: Any, m: float) -> Any:
 
 
 _SERIES_LIMIT = 0.02
-_SERIES_TERMS = 9  # the first one left out is below 1e-15 at the limit for |m| <= 10
+_SERIES_TERMS = 9  # the first omitted term is below 1e-15 at the limit for |m| <= 10
 
 
 def _cosh_m_asinh_sqrt(ufl: Any, s: Any, m: float) -> Any:
     near = ufl.lt(s, _SERIES_LIMIT)
-    # The closed form must stay differentiable where it isn't used: 0 * NaN would be NaN.
+    # The closed form must stay differentiable even where it isn't used: 0 * NaN is NaN.
     root = ufl.sqrt(ufl.conditional(near, _SERIES_LIMIT, s))
     growth = (root + ufl.sqrt(1.0 + root**2)) ** m
     closed = 0.5 * (growth + 1.0 / growth)
@@ -181,19 +181,19 @@ def _series(s: Any, m: float) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Jet:
-    """Values (k,) with derivatives by the four components of F, or none: (4, k) and (4, 4, k)."""
+    """Values (k,) with first (4, k) and second (4, 4, k) derivatives by F's four components."""
 
     value: FloatArray
     slope: FloatArray
     curvature: FloatArray
 
     def of(self, value: FloatArray, first: FloatArray, second: FloatArray) -> Jet:
-        """A function of this, by its value and its first two derivatives."""
+        """A function of this jet, given its value and first two derivatives."""
         bent = second * self.slope[:, None] * self.slope
         return Jet(value, first * self.slope, first * self.curvature + bent)
 
     def through(self, function: Callable[[Jet], Jet]) -> Jet:
-        """A function of this, differentiated by one variable instead of by four."""
+        """A function of this jet, differentiated by one variable instead of by four."""
         if not len(self.slope):
             return function(self)
         zero = 0.0 * self.value
@@ -237,7 +237,7 @@ class Jet:
 
 
 class JetMatrix:
-    """F as a 2 x 2 matrix of jets, and the functions of it that UFL calls by the same names."""
+    """F as a 2 x 2 matrix of jets, with functions named as in UFL."""
 
     def __init__(self, F: FloatArray, derivatives: int = 4) -> None:
         (count, d), self._entries = (len(F), derivatives), dict[tuple[int, int], Jet]()
@@ -257,7 +257,7 @@ class JetMatrix:
 
     @staticmethod
     def inner(F: JetMatrix, G: JetMatrix) -> Jet:
-        """F : G."""
+        """Double contraction F : G."""
         return sum((F[i, j] * G[i, j] for i in (0, 1) for j in (0, 1)), start=F[0, 0] * 0.0)
 
     @staticmethod
@@ -273,12 +273,12 @@ class JetMatrix:
 
     @staticmethod
     def lt(x: Jet, y: float) -> BoolArray:
-        """Where x < y."""
+        """True where x < y."""
         return np.asarray(x.value < y)
 
     @staticmethod
     def conditional(where: BoolArray, x: Jet | float, y: Jet | float) -> Jet:
-        """The first where that holds, else the second."""
+        """``x`` where ``where`` is True, else ``y``."""
         like = x if isinstance(x, Jet) else y
         assert isinstance(like, Jet)
         x, y = (part if isinstance(part, Jet) else like * 0.0 + part for part in (x, y))

@@ -1,8 +1,8 @@
 """T6 meshes with the specimen's own symmetries: one quarter cell, mirrored and tiled.
 
-A mesh without the mirror symmetries turns the bifurcation into an imperfect one, and Newton slips
-onto a branch unnoticed. So gmsh meshes only a few small blocks, whose shared sides are divided
-alike, and numpy reflects and places them. Mid-side nodes of hole edges lie on the ellipse.
+A mesh without the mirror symmetries makes the bifurcation imperfect, and Newton's method may slip
+onto a branch unnoticed. So gmsh meshes only a few small blocks, with equal divisions on shared
+sides, and numpy reflects and places them. Mid-side nodes of hole edges lie on the ellipse.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.machine import require_memory
 
-if TYPE_CHECKING:  # imported where it is needed: a child that meshes starts in half the time
+if TYPE_CHECKING:  # imported where needed: a child process for meshing starts in half the time
     from modeharvest.fem.field import Mesh
 
 
 def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
-    """Move a mesh's holes at random; InputError if 4 standard deviations are half a ligament."""
+    """Move a mesh's holes randomly; InputError if 4 standard deviations exceed half a ligament."""
     half = 0.5 * specimen.ligament_width
     growth_sd = imperfection.diameter_sd + imperfection.ovality_sd
     reach = 4.0 * (imperfection.position_sd + 0.5 * growth_sd)
@@ -44,12 +44,12 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
 
 
 def hole_motion(nodes: FloatArray, specimen: Specimen, holes: FloatArray) -> FloatArray:
-    """(n, 2) motion of nodes (n, 2) for holes that are off the specimen's (holes, 5) [mm].
+    """(n, 2) motion of nodes (n, 2) due to deviations ``holes`` (holes, 5) of the holes [mm].
 
-    By x and y of their centres; by their diameter, which leaves the aspect of an ellipse; by
-    how much they are longer along x and shorter along y; and by the same along the diagonals x = y
-    and x = -y. Edges of holes stay ellipses; the motion fades out towards the cell's boundary, so
-    cells do not disturb each other and the outer edges stay straight. Linear in ``holes``.
+    The deviations are: x and y of the centre; the diameter, at constant aspect of an ellipse; the
+    ovality, longer along x and shorter along y; and the same along the diagonals x = y and x = -y.
+    Edges of holes stay ellipses. The motion decreases to zero at the cell's boundary, so cells do
+    not affect each other and the outer edges stay straight. Linear in ``holes``.
     """
     number, scale = specimen.nearest_hole(nodes), np.array([1.0, specimen.aspect])
     radius, outer = 0.5 * specimen.diameters[number], 0.5 * specimen.largest_diameter
@@ -63,12 +63,12 @@ def hole_motion(nodes: FloatArray, specimen: Specimen, holes: FloatArray) -> Flo
     return np.asarray(weight[:, None] * (holes[number, :2] + growth * scale))
 
 
-# Reflecting a T6 element turns it inside out; this reorders its nodes counter-clockwise.
+# Reflection inverts a T6 element; this reorders its nodes counter-clockwise.
 REVERSED_T6 = [0, 2, 1, 5, 4, 3]
 _BYTES_PER_ELEMENT = 15e3
-"""Of meshing, assembling and factorising; 13 kB were measured from 9 000 to 83 000 elements."""
+"""Memory for meshing, assembly and factor; 13 kB were measured for 9 000 to 83 000 elements."""
 SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
-"""Of the coordinates in the four quarters of a plane."""
+"""Signs of the coordinates (x, y) in the four quadrants."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ class MeshBlock:
     """A small T6 mesh to be placed many times."""
 
     nodes: FloatArray
-    """(n, 2) [mm]."""
+    """(n, 2) positions [mm]."""
     cells: IntArray
-    """(m, 6) node numbers."""
+    """(m, 6) node numbers of each element."""
 
     def placed(self, sign: tuple[float, float], origin: tuple[float, float]) -> MeshBlock:
         """The block reflected about its own axes by ``sign`` and moved to ``origin`` [mm]."""
@@ -86,7 +86,7 @@ class MeshBlock:
         return MeshBlock(np.asarray(origin) + np.asarray(sign) * self.nodes, cells)
 
     def turned(self, angle: float) -> MeshBlock:
-        """The block turned counter-clockwise about the origin by ``angle`` [rad]."""
+        """The block rotated counter-clockwise about the origin by ``angle`` [rad]."""
         c, s = math.cos(angle), math.sin(angle)
         return MeshBlock(self.nodes @ np.array([[c, s], [-s, c]]), self.cells)
 
@@ -100,13 +100,13 @@ def quarter_cell(pitch: float, diameter: float, size: float) -> MeshBlock:
 def quarter_polygon(
     heights: tuple[float, float], width: float, radii: tuple[float, float], size: float
 ) -> MeshBlock:
-    """A quarter of a unit cell about an elliptical hole, the hole's centre at the origin.
+    """A quarter of a unit cell around an elliptical hole with its centre at the origin.
 
     InputError if ``size`` leaves fewer than two elements on a quarter of the hole's edge.
 
-    heights : of the cell's upper side at x = width and at x = 0 [mm]; the same for a rectangle.
+    heights : y of the cell's upper side at x = width and at x = 0 [mm]; equal for a rectangle.
     width : half the cell's width [mm].
-    radii : the hole's, along x and y [mm].
+    radii : semi-axes of the hole along x and y [mm].
     size : target edge length of the elements [mm].
     """
     from scipy.special import ellipe
@@ -132,10 +132,10 @@ def rectangle(width: float, height: float, n_width: int, n_height: int) -> MeshB
 
 
 def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
-    """The specimen's T6 mesh, symmetric to the last bit about the axes that the holes have.
+    """The specimen's T6 mesh, exactly symmetric (to the last bit) about the holes' mirror axes.
 
-    Those are both, unless diameters are graded. ``size`` is the elements' target edge length [mm];
-    InputError if it is not positive, or too large for the cells.
+    These are both axes, unless diameters are graded. ``size``: target edge length of the elements
+    [mm]; InputError if it is not positive, or too large for the cells.
     """
     width, height = specimen.half_size
     require_size(size, 4.0 * width * height)
@@ -143,10 +143,10 @@ def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
 
 
 def require_size(size: float, area: float) -> None:
-    """Refuse an edge length of elements [mm] with which nothing could be computed.
+    """Raise InputError for an unusable edge length ``size`` of elements [mm].
 
-    InputError if it is not positive, or so small that meshing and factorising would need more
-    memory than there is; ``area`` [mm^2] is what they are to fill, holes included.
+    That is, if it is not positive, or so small that meshing and factorisation would need more
+    memory than there is; ``area``: area to be meshed, including holes [mm^2].
     """
     if not 0 < size < math.inf:
         raise InputError(f"mesh size: expected a positive length in mm, got {size}")
@@ -156,7 +156,7 @@ def require_size(size: float, area: float) -> None:
 
 
 def join(blocks: list[MeshBlock], tolerance: float) -> Mesh:
-    """One T6 mesh of placed blocks; nodes closer than ``tolerance`` [mm] become one."""
+    """Join blocks to one T6 mesh; nodes closer than ``tolerance`` [mm] are merged."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -171,7 +171,7 @@ def join(blocks: list[MeshBlock], tolerance: float) -> Mesh:
     count, label = connected_components(links, directed=False)
     merged = np.empty((count, 2))
     for axis, values in enumerate(np.where(np.abs(nodes) < tolerance, 0.0, nodes).T):
-        # Of coordinates that differ by rounding take the smallest: mirror images do the same.
+        # Of coordinates that differ by rounding, take the smallest: consistent with mirror images.
         order = np.lexsort((np.abs(values), label))
         _, first = np.unique(label[order], return_index=True)
         merged[:, axis] = values[order][first]
@@ -213,10 +213,10 @@ def _tiles(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
 
 
 def _fillers(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
-    """What the hexagonal cells of staggered rows leave of a rectangle.
+    """Blocks that complete the hexagonal cells of staggered rows to a rectangle.
 
-    Half a cell without a hole at either end of a shorter row; triangles between the corners of
-    the cells at top and bottom, and the bulk beside the last of these.
+    These are half cells without a hole at both ends of a shorter row, triangles between the
+    corners of the cells at top and bottom, and the bulk beside the last triangles.
     """
     half, (low, high) = 0.5 * specimen.pitch, specimen.cell_heights
     a, _ = specimen.cellular_half_size
@@ -228,7 +228,7 @@ def _fillers(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
     last = specimen.holes_y - 1
     for row, (y, count) in enumerate(zip(specimen.row_heights, specimen.row_counts, strict=True)):
         is_full = count == specimen.holes_x
-        halves = [] if is_full else [(-a, 1.0), (a, -1.0)]  # and the side that is inwards
+        halves = [] if is_full else [(-a, 1.0), (a, -1.0)]  # x, and direction inwards
         for x, sign in halves:
             yield from (end.placed((sign, up), (x, y)) for up in (1.0, -1.0))
         centres = centred(count) * specimen.pitch
@@ -243,12 +243,12 @@ def _fillers(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
 def mesh_block(
     corners: list[tuple[float, float]], divisions: list[int], arcs: Collection[int] = ()
 ) -> MeshBlock:
-    """Let gmsh mesh a polygon with T6 elements.
+    """Mesh a polygon with T6 elements, by gmsh.
 
     corners, divisions : the polygon's corners, counter-clockwise [mm]; number of elements on each
-        side, the first from the first corner to the second.
-    arcs : numbers of those sides that are arcs about the origin: of a circle, or, where they end on
-        both axes, of an ellipse.
+        side, the first side from the first to the second corner.
+    arcs : numbers of the sides that are arcs about the origin: of a circle, or, if they end on both
+        axes, of an ellipse.
     """
     with quiet_gmsh():
         geo = gmsh.model.geo
@@ -275,7 +275,7 @@ def mesh_block(
 
 @contextmanager
 def quiet_gmsh() -> Iterator[None]:
-    """An empty gmsh model that prints nothing; models that the caller has open are kept."""
+    """Context with an empty gmsh model and no output; the caller's open models are kept."""
     if ours := not gmsh.isInitialized():
         gmsh.initialize(interruptible=False)
     before = gmsh.model.getCurrent()
@@ -294,7 +294,7 @@ def quiet_gmsh() -> Iterator[None]:
 
 @contextmanager
 def gmsh_options(numbers: Mapping[str, float]) -> Iterator[None]:
-    """Options of gmsh by their names, as long as the context lasts."""
+    """Context in which options of gmsh, by name, have given values."""
     kept = {name: gmsh.option.getNumber(name) for name in numbers}
     for name, value in numbers.items():
         gmsh.option.setNumber(name, value)
@@ -319,11 +319,11 @@ def mesh_boundaries(
 ) -> MeshBlock:
     """Mesh plane bodies bounded by smooth curves with T6 elements.
 
-    parts : Of each body its loops, the outer one first, then those of holes. A loop is a sequence
-        of curves (k, 2) [any unit], each of which ends where the next one begins; between their
-        ends the curves are splines through their points.
-    size, edge_size : Edge length of the elements inside and along the loops [the same unit],
-        growing from one to the other over two elements; shorter ones where a loop is short.
+    parts : For each body its loops: the outer boundary first, then the holes. A loop is a sequence
+        of curves (k, 2) [any unit], each of which ends where the next one begins; each curve is a
+        spline through its points.
+    size, edge_size : Edge length of the elements inside and along the loops [the same unit], with
+        a transition over two elements; shorter along short loops.
     """
     grow = {"Mesh.MeshSizeExtendFromBoundary": 0, "Mesh.MeshSizeMax": size}
     with quiet_gmsh(), gmsh_options(grow):
@@ -363,6 +363,6 @@ def _add_loop(loop: Collection[FloatArray], size: float) -> int:
     return int(geo.addCurveLoop(curves))
 
 
-if __name__ == "__main__":  # so that a child can have a time limit: gmsh can't be interrupted
+if __name__ == "__main__":  # run in a child process with a time limit: gmsh can't be interrupted
     block = mesh_boundaries(*pickle.load(sys.stdin.buffer))
     sys.stdout.buffer.write(pickle.dumps((block.nodes, block.cells)))

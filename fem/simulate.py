@@ -35,10 +35,10 @@ def simulate(
 ) -> Solution:
     """Run a virtual compression test (collective over ``comm``; every rank gets the result).
 
-    The solution's ``info["outcome"]`` says how far the path went; where it ended early, the
-    snapshots reached are there. ``info["warnings"]`` names states that are not stable although
-    their branch is meant to be. ``info["critical"]`` is None where the specimen stays stable, or
-    is imperfect. An InputError refuses a size of elements that can't mesh the specimen.
+    The solution's ``info["outcome"]`` says how far the path was followed; if it ended early, the
+    solution has the snapshots reached. ``info["warnings"]`` names unstable states on branches that
+    should be stable. ``info["critical"]`` is None if the specimen stays stable, or is imperfect.
+    InputError for an element size that can't mesh the specimen.
     """
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
@@ -74,7 +74,7 @@ class _Run:
     follower: PathFollower
 
     def solution(self) -> Solution:
-        """Follow the path and put together what it gave."""
+        """Follow the path and collect the solution."""
         path, critical = self._primary()
         branches = {} if critical is None else self._branches(self._oriented(critical))
         limit = _stable_until(path, critical)
@@ -90,12 +90,12 @@ class _Run:
         return Solution(self.mesh, tuple(snapshots), info)
 
     def _primary(self) -> tuple[list[State], Critical | None]:
-        """The primary path, and where it becomes unstable; beyond that only on request.
+        """The primary path and its critical point; the path beyond it only on request.
 
-        Without a bifurcation there is one natural path, which bends where the pattern sets in:
-        in an imperfect specimen, under tilted loading, and in a specimen with an odd number of
-        holes both ways, whose pattern has its own symmetries. Long steps slip off it, so it is
-        followed again from the last stable state, and no unstable one is accepted.
+        Without a bifurcation there is one natural path, which bends where the pattern sets in.
+        This is so with imperfections, under tilted loading, and with odd numbers of holes in both
+        directions, where the pattern keeps the symmetry. Long steps may leave this path; it is then
+        followed again from the last stable state, and unstable states are refused.
         """
         strains = self.experiment.strains
         path = [self.follower.start()]
@@ -114,10 +114,10 @@ class _Run:
         return path, None
 
     def _oriented(self, critical: Critical) -> Critical:
-        """The critical point with its mode turned to a positive overlap with the pattern.
+        """The critical point, its mode with the sign of a positive overlap with the pattern.
 
-        A mode of another symmetry has none, nor has one of staggered rows; there a field without
-        symmetries decides, so that the sign isn't left to rounding.
+        A mode of another symmetry, or of staggered rows, has no overlap. Then the overlap with a
+        field without symmetries is used, so that the sign doesn't depend on rounding.
         """
         mode, spec = critical.modes[0], self.experiment.specimen
         overlap = 0.0 if spec.is_staggered else self._pattern_overlap(mode)
@@ -133,10 +133,10 @@ class _Run:
         return mode.overlap(pattern) / float(np.sqrt(pattern.dot(weighted)))
 
     def _pattern_share(self, mode: Mode) -> float:
-        """Overlap with the pattern if its amplitude may differ from cell to cell.
+        """Share of the pattern, with a free amplitude in each cell, in a mode x [-].
 
-        The root of the part of x . M x that lies in the span of the pattern's restrictions
-        to single unit cells: 1 for the pattern with any smooth envelope.
+        The root of the fraction of x . M x in the span of the pattern's restrictions to single
+        unit cells: 1 for the pattern with any smooth envelope.
         """
         structure, spec, nodes = self.follower.structure, self.experiment.specimen, self.mesh.nodes
         pattern = spec.pattern(nodes)
@@ -203,7 +203,7 @@ class _Run:
         }
 
     def _curve(self, states: list[State]) -> dict[str, Any]:
-        """Quantities along a path, for plots: one entry for each state."""
+        """Quantities along a path, for plots, with one entry for each state."""
         structure, length = self.follower.structure, self.experiment.specimen.length
         return {
             "nominal_strain": [s.strain for s in states],
@@ -216,7 +216,7 @@ class _Run:
     def _outcome(
         self, snapshots: list[Snapshot], limit: float, paths: dict[str, list[State]]
     ) -> str:
-        """Whether every strain was met, or which branch lacks which; primary up to ``limit``."""
+        """Text: "complete", or strains that branches lack; up to ``limit`` only primary counts."""
         size, thin = self.experiment.mesh_size, self.experiment.specimen.ligament_width
         coarse = f"; {size:g} mm is a coarse mesh_size for ligaments of {thin:.2g} mm"
         reasons, hint = [], coarse if size > 0.5 * thin else ""
@@ -238,20 +238,20 @@ class _Run:
 
 
 def _stable_until(path: list[State], critical: Critical | None) -> float:
-    """The strain up to which the primary path is known to be stable; infinity if all of it."""
+    """The strain up to which the primary path is known to be stable; infinity if throughout."""
     stable = max(state.strain for state in path if state.negative_pivots == 0)
     reached = stable if path[-1].negative_pivots else np.inf
     return reached if critical is None else critical.strain
 
 
-_ATTEMPTS = 3  # with shorter and shorter steps
+_ATTEMPTS = 3  # each with shorter steps
 
 
 class PatternMeasure(Protocol):
-    """A pattern in nodal displacements (n, 2) [mm]."""
+    """Measures a pattern in nodal displacements (n, 2) [mm]."""
 
     def share(self, displacement: FloatArray) -> float:
-        """How much of a field is the pattern, between -1 and 1; its sign is the pattern's."""
+        """Share of the pattern in a field, -1 to 1 [-]; its sign is that of the amplitude."""
 
     def amplitude(self, displacement: FloatArray) -> float:
         """The pattern's amplitude [mm]."""
@@ -266,15 +266,15 @@ def simulate_pattern(
 ) -> Solution:
     """Compress a perfect specimen beyond buckling until its pattern has a given amplitude.
 
-    Without the unstable primary path, which costs most where ligaments are thin. The solution has
-    one snapshot, on the branch that leaves the primary path at its first critical point. Without
-    such a point it is the last stable state, and ``info["critical"]`` is None; else that has the
-    ``strain`` and ``pattern_overlap_by_cell``, the buckling mode's share. ``info["outcome"]`` is
-    "complete" or the reason why not.
+    The unstable primary path, which costs most if ligaments are thin, is not followed. The solution
+    has one snapshot, on the branch from the first critical point of the primary path. Without a
+    critical point it is the last stable state, and ``info["critical"]`` is None; otherwise this has
+    ``strain`` and ``pattern_overlap_by_cell``, the pattern's share in the buckling mode.
+    ``info["outcome"]`` is "complete" or the reason why not.
 
-    experiment, mesh : its strains and branches are not used; the mesh of its specimen.
-    pattern, target : what is measured, and the amplitude to be reached [mm].
-    largest_strain : up to which to look for the first critical point [-].
+    experiment, mesh : its strains and branches are ignored; the mesh of its specimen.
+    pattern, target : measure of the pattern, and the amplitude to be reached [mm].
+    largest_strain : strain up to which to look for the first critical point [-].
     """
     spec, follower = experiment.specimen, _follower(experiment, mesh, MPI.COMM_SELF)
     structure = follower.structure
@@ -312,8 +312,8 @@ def _until_critical(
 ) -> tuple[State, Critical | None, str]:
     """The last stable state of the primary path, its first critical point, and the outcome.
 
-    Where no bifurcation is found between the last two states, steps were too long to stay on the
-    path: it is followed again from the stable one with shorter steps.
+    If no bifurcation is found between the last two states, the steps were too long to stay on the
+    path: it is followed again from the stable state with shorter steps.
     """
     path = [follower.start()]
     for _ in range(_ATTEMPTS):

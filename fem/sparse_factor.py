@@ -1,7 +1,7 @@
-"""Factorisation of sparse symmetric matrices of one pattern, by a library, and their inertia.
+"""Factorisation of sparse symmetric matrices with one pattern by a library, and their inertia.
 
-MUMPS through petsc4py, which is there beside dolfinx, finds the order of elimination once for all
-matrices of a pattern. Without it SciPy's SuperLU does the work, in several times as long.
+MUMPS through petsc4py, which is installed with dolfinx, determines the elimination order once for
+all matrices of a pattern. Without it, SciPy's SuperLU is used, which takes several times as long.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from modeharvest.util.errors import SingularMatrixError
 def factorise(
     matrix: csr_array, library: str | None = None, definite: bool = True, block: int = 1
 ) -> Factor:
-    """Factorise a symmetric matrix, of sorted indices.
+    """Factorise a symmetric sparse matrix with sorted indices.
 
-    ModuleNotFoundError: the library named isn't there. SingularMatrixError, here or updated.
+    ModuleNotFoundError without the named library; SingularMatrixError, here or in ``update``.
 
     matrix : (n, n), both triangles.
-    library : a name among ``LIBRARIES``; by default MUMPS if it is there.
-    definite : whether all matrices are known to be positive definite; else L D L^T, with pivoting.
-    block : unknowns of a node, one after another: MUMPS then orders nodes, in half the time.
+    library : a name among ``LIBRARIES``; by default MUMPS if available.
+    definite : whether all matrices are known to be positive definite; else L D L^T with pivoting.
+    block : number of consecutive unknowns per node; MUMPS then orders nodes, in half the time.
     """
     best = "mumps" if find_spec("petsc4py") else "superlu"
     return LIBRARIES[library or best](matrix, definite, block)
@@ -50,8 +50,8 @@ class _Mumps:
         self._pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
         self._pc.setFactorSetUpSolverType()
         self._factor = self._pc.getFactorMatrix()
-        self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
-        self._factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
+        self._factor.setMumpsIcntl(8, 0)  # no scaling: all unknowns are of the same kind
+        self._factor.setMumpsIcntl(13, 1)  # root front on one rank, so that its inertia is counted
         self._factor.setMumpsIcntl(14, 60 if definite else 200)  # room for fill-in and pivoting [%]
         self._factor.setMumpsIcntl(15, -block if block > 1 else 0)  # order blocks
         self.update(matrix)
@@ -102,9 +102,9 @@ class _SuperLU:
 
 
 def negative_pivots(factor: Any) -> int:
-    """Number of negative eigenvalues of a Hermitian matrix by its factor of SuperLU.
+    """Number of negative eigenvalues of a Hermitian matrix, from its SuperLU factor.
 
-    An ArithmeticError where a zero pivot made SuperLU leave the diagonal: signs mean nothing then.
+    ArithmeticError if a zero pivot made SuperLU pivot off the diagonal: signs are then meaningless.
     """
     if not np.array_equal(factor.perm_r, factor.perm_c):
         raise ArithmeticError("a zero pivot: the matrix is singular or nearly so")
@@ -112,7 +112,7 @@ def negative_pivots(factor: Any) -> int:
 
 
 Factor = _Mumps | _SuperLU
-"""A factorised matrix, and in ``library`` what factorised it. ``update`` takes another one of the
-same pattern, ``solve`` a right-hand side (n,) or several (n, k); ``negative_pivots`` counts
-negative eigenvalues, by Sylvester's law of inertia."""
+"""A factorised matrix; ``library`` is the library used. ``update`` factorises another matrix of the
+same pattern; ``solve`` takes a right-hand side (n,) or several (n, k); ``negative_pivots`` is the
+number of negative eigenvalues, by Sylvester's law of inertia."""
 LIBRARIES: dict[str, type[Factor]] = {"mumps": _Mumps, "superlu": _SuperLU}

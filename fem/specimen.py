@@ -1,4 +1,4 @@
-"""The finite specimen: a lattice of holes in a rectangle with bulk edges; their scatter."""
+"""The finite specimen: a lattice of holes in a rectangle with bulk edges; scatter of the holes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within
 
 MOST_HOLES = 1000
-"""In a direction."""
+"""Largest number of holes in a direction."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Stacking:
     """How rows of holes along x are stacked along y."""
 
     shift: float
-    """By how much a row is moved along x against the one below: 0, or 0.5 [pitch]."""
+    """Offset of a row along x relative to the row below: 0 or 0.5 [pitch]."""
     rise: float | None
-    """Distance of the rows [pitch]; None where ``pitch_y`` gives it."""
+    """Distance of the rows [pitch]; None if ``pitch_y`` gives it."""
 
 
 STACKINGS = {
@@ -43,14 +43,14 @@ class Specimen:
 
     In triangular stacking every second row, counted from below, has one hole less: no hole is cut,
     the specimen is symmetric about the y axis, and with an odd number of rows about the x axis too.
-    The cellular part is the bounding box of the holes' cells; what these leave of it is solid.
+    The cellular part is the bounding box of the holes' cells; its rest is solid.
     """
 
     holes_x: int = 6
     holes_y: int = 10
     """Number of holes in a row, along the loading direction; number of rows."""
     diameter: float = 1.5
-    """Hole diameter d, of ellipses along x, of a graded specimen at its centre [mm]."""
+    """Hole diameter d [mm]; of ellipses along x; of a graded specimen at its centre."""
     pitch: float = 1.9
     """Centre-to-centre distance l along a row, the unit cell size [mm]."""
     bulk_x: float = 1.9
@@ -58,13 +58,13 @@ class Specimen:
     """Width of the solid strips at loaded and at free edges [mm]; 0: none."""
     grading_x: float = 0.0
     grading_y: float = 0.0
-    """Change of the diameter from hole to hole, per distance of their centres in the loading and in
-    the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x + grading_y y. A specimen
-    graded in one direction keeps its mirror symmetry in the other. Ellipses keep their aspect."""
+    """Gradients of the diameter along the loading and the transverse direction [mm/mm]: a hole with
+    its centre at (x, y) has d(x, y) = diameter + grading_x x + grading_y y. A specimen graded in
+    one direction keeps its mirror symmetry in the other. Ellipses keep their aspect."""
     stacking: str = "square"
     """"square", "rectangular" or "triangular" (equilateral, rows along x): ``STACKINGS``."""
     pitch_y: float | None = None
-    """Distance of the rows [mm] of rectangular stacking; others have it from ``pitch``."""
+    """Distance of the rows in rectangular stacking [mm]; in others it follows from ``pitch``."""
     diameter_y: float | None = None
     """Diameter of elliptical holes along y [mm]; None for round ones."""
 
@@ -118,13 +118,13 @@ class Specimen:
             )
 
     def plain(self) -> dict[str, Any]:
-        """As files have it: what was added to the square lattice of circles only where used."""
+        """Values for files; options beyond the square lattice of circles only if used."""
         usual = {"stacking": "square", "pitch_y": None, "diameter_y": None}
         return {n: v for n, v in asdict(self).items() if n not in usual or v != usual[n]}
 
     @property
     def is_staggered(self) -> bool:
-        """Whether every second row is moved by half a pitch."""
+        """Whether every second row is offset by half a pitch."""
         return STACKINGS[self.stacking].shift != 0.0
 
     @property
@@ -135,7 +135,7 @@ class Specimen:
 
     @property
     def vectors(self) -> FloatArray:
-        """(2, 2) the hole lattice's vectors as rows [mm]: along a row, and to the next row."""
+        """(2, 2) vectors of the hole lattice as rows [mm]: along a row, and to the next row."""
         shift = STACKINGS[self.stacking].shift * self.pitch
         return np.array([[self.pitch, 0.0], [shift, self.row_distance]])
 
@@ -146,21 +146,21 @@ class Specimen:
 
     @property
     def largest_diameter(self) -> float:
-        """At which holes of this aspect would touch [mm]."""
-        row = self.row_distance / self.aspect  # where y is scaled so that holes are circles
+        """Diameter at which holes of this aspect would touch [mm]."""
+        row = self.row_distance / self.aspect  # with y scaled so that holes are circles
         return min(self.pitch, math.hypot(0.5 * self.pitch, row) if self.is_staggered else row)
 
     @property
     def ligament_width(self) -> float:
-        """Of the thinnest ligament between two holes [mm]."""
+        """Width of the thinnest ligament between two holes [mm]."""
         return float((self.largest_diameter - self.diameters.max()) * min(1.0, self.aspect))
 
     @property
     def cell_heights(self) -> tuple[float, float]:
         """y of the upper corners of a hole's cell at x = l/2 and at x = 0 [mm].
 
-        The cell is what is nearest to a hole where y is scaled so that holes are circles: a
-        rectangle, and in staggered rows a hexagon with two sides along y.
+        The cell is the region nearest to a hole, with y scaled so that holes are circles: a
+        rectangle, or in staggered rows a hexagon with two sides along y.
         """
         half = 0.5 * self.row_distance
         if not self.is_staggered:
@@ -170,9 +170,9 @@ class Specimen:
 
     @property
     def quarter_places(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) middles of ligaments and (m, 2) of junctions around a hole, from its centre [mm].
+        """Centres of ligaments (n, 2) and of junctions (m, 2) relative to a hole's centre [mm].
 
-        Of the quarter of its cell where x and y are positive.
+        They are those in the quarter of its cell with x, y >= 0.
         """
         half, (low, high) = 0.5 * self.pitch, self.cell_heights
         if not self.is_staggered:
@@ -194,7 +194,7 @@ class Specimen:
 
     @property
     def length(self) -> float:
-        """L, the length of the cellular part, which nominal strain refers to [mm]."""
+        """L, the length of the cellular part, to which nominal strain refers [mm]."""
         return self.holes_x * self.pitch
 
     @property
@@ -213,7 +213,7 @@ class Specimen:
 
     @property
     def hole_centres(self) -> FloatArray:
-        """(holes, 2) positions of the hole centres [mm], exactly symmetric; from left to right."""
+        """(holes, 2) positions of the hole centres [mm], exactly symmetric; sorted by x, then y."""
         rows = zip(self.row_heights, self.row_counts, strict=True)
         centres = np.array([(x, y) for y, count in rows for x in centred(count) * self.pitch])
         return np.asarray(centres[np.lexsort((centres[:, 1], centres[:, 0]))])
@@ -225,14 +225,14 @@ class Specimen:
 
     @property
     def mid_junctions(self) -> tuple[tuple[float, float], ...]:
-        """Corners (x, 0) of the unit cells between the holes [mm], on the line of mid-height."""
+        """Cell corners (x, 0) between holes on the line of mid-height [mm]."""
         x = (np.arange(1, self.holes_x) - 0.5 * self.holes_x) * self.pitch
         return tuple((float(at), 0.0) for at in x)
 
     def nearest_hole(self, points: FloatArray) -> NDArray[np.int64]:
-        """(n,) number of the hole whose unit cell each of ``points`` (n, 2) [mm] is in, or nearest.
+        """(n,) number of the hole whose cell contains, or is nearest to, each point (n, 2) [mm].
 
-        Nearest where y is scaled so that holes are circles, as in ``cell_heights``.
+        Distances are measured with y scaled so that holes are circles, as in ``cell_heights``.
         """
         counts, heights = self.row_counts, self.row_heights
         rows = np.repeat(np.arange(self.holes_y), counts)
@@ -257,8 +257,8 @@ class Specimen:
         """The rectangular lattice's buckling pattern at ``points`` (n, 2), amplitude 1 [-].
 
         u_x = -cos(pi x/l) sin(pi y/l), u_y = sin(pi x/l) cos(pi y/l) with the origin at a
-        solid junction between four holes (Eq. (mode) of the paper); holes rotate into
-        ellipses, neighbours in opposite senses. Along y, l is the distance of the rows.
+        solid junction between four holes (Eq. (mode) of the paper). Holes become ellipses,
+        neighbours rotate in opposite senses. Along y, l is the distance of the rows.
         """
         a, b = self.cellular_half_size
         x = np.pi * (points[:, 0] + a) / self.pitch
@@ -266,20 +266,20 @@ class Specimen:
         return np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], axis=-1)
 
     def asymmetric(self, points: FloatArray) -> FloatArray:
-        """A field (n, 2) at points that no symmetry of a rectangle maps to plus or minus itself."""
+        """A field at points (n, 2) that no symmetry of a rectangle maps to plus or minus itself."""
         x, y = (points / self.half_size).T
         along, across = (1.0 + 0.7 * x) * (1.0 + 0.3 * y), (1.0 - 0.2 * x) * (1.0 - 0.6 * y)
         return np.stack([along, across], axis=1)
 
 
 def centred(count: int) -> FloatArray:
-    """(count,) numbers at a distance of 1, with a mean of exactly 0."""
+    """(count,) numbers with spacing 1 and a mean of exactly 0."""
     return np.asarray(np.arange(count) - 0.5 * (count - 1))
 
 
 @dataclass(frozen=True)
 class Imperfection:
-    """Independent normal scatter of every hole."""
+    """Independent normally distributed scatter of every hole."""
 
     position_sd: float = 0.0
     """Standard deviation of each coordinate of a hole's centre [mm]."""
@@ -287,7 +287,7 @@ class Imperfection:
     """Standard deviation of a hole's diameter [mm]."""
     seed: int = 0
     ovality_sd: float = 0.0
-    """Standard deviation of by how much a hole is longer along x and shorter along y, and likewise
+    """Standard deviation of a hole's ovality: longer along x and shorter along y, and the same
     along the diagonals [mm]."""
 
     def __post_init__(self) -> None:
@@ -301,7 +301,7 @@ class Imperfection:
         return self.position_sd == self.diameter_sd == self.ovality_sd == 0.0
 
     def drawn(self, count: int) -> FloatArray:
-        """(count, 5) by how much holes are off, see ``fem.meshing.hole_motion`` [mm]."""
+        """(count, 5) random deviations of holes, see ``fem.meshing.hole_motion`` [mm]."""
         random = np.random.default_rng(self.seed)
         shift = random.normal(0.0, 1.0, (count, 2)) * self.position_sd
         growth = random.normal(0.0, 1.0, count) * self.diameter_sd

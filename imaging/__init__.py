@@ -1,8 +1,8 @@
-"""Speckle images whose truth is known at every pixel, photographs, and lenses.
+"""Speckle images with a known displacement at every pixel, photographs, and lenses.
 
-``spec`` and ``imageset`` make sets of images of a deforming specimen; ``render`` shows one state,
-``camera`` and ``sensor`` what a camera makes of it; ``grid`` relates pixels to millimetres and is
-the one place for the y flip; ``spline`` gives values and gradients of a measured image between its
-pixels. ``speckle`` is the pattern, known at any point, ``mapping`` the inverse isoparametric
-mapping, ``photographs`` the files of a camera, ``distortion`` lenses and their calibration.
+``spec`` and ``imageset`` make sets of images of a deforming specimen. ``render`` images one state;
+``camera`` and ``sensor`` model the camera. ``grid`` converts between pixels and millimetres and is
+the only module that flips y. ``spline`` gives values and gradients of a measured image between its
+pixels. ``speckle`` is the pattern, known at any point; ``mapping`` is the inverse isoparametric
+mapping; ``photographs`` reads a camera's files; ``distortion`` has lenses and their calibration.
 """

@@ -1,9 +1,9 @@
-"""What a camera makes of a specimen's state: lens, averaging pixels, exposure, files.
+"""Camera model: lens, pixels that average over an aperture, exposure, image files.
 
-Where pixels average over an aperture, the reference image is exact in Fourier space away from the
-edge of the material. A deformed image is summed over the points of a Gauss rule in each pixel of
-the *deformed* frame, as many as keep the error below :data:`TOLERANCE`, each found in the mesh and
-evaluated exactly. Near an edge, both images average evenly scattered points.
+Where pixels average over an aperture, the reference image is computed exactly in Fourier space,
+except near the edge of the material. A deformed image is a Gauss quadrature over each pixel of the
+*deformed* frame. It has as many points as keep the error below :data:`TOLERANCE`; each is located
+in the mesh and evaluated exactly. Near an edge, both images average evenly scattered points.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.util.arrays import BoolArray, FloatArray
 
-TOLERANCE = 1e-7  # of full scale, rms: its largest among millions of pixels stays below 1e-6
-_MOST_POINTS = 16  # a side
+TOLERANCE = 1e-7  # rms, of full scale: the largest of millions of pixels' errors is below 1e-6
+_MOST_POINTS = 16  # along each axis
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class PixelQuadrature:
     """How the pixels of an image were averaged."""
 
     points: int
-    """Points in each pixel away from the edges; 0: none needed, the average is exact."""
+    """Quadrature points in each pixel away from the edges; 0 if the average is exact."""
     rms_bound: float
-    """Bound of their root-mean-square error on the pattern [fraction of full scale]."""
+    """Bound of the quadrature's rms error on the pattern [fraction of full scale]."""
     edge_points: int = EDGE_POINTS
     """Points in each pixel near an edge."""
 
@@ -41,7 +41,7 @@ class PixelQuadrature:
 def integrate(
     state: ImagedState, aperture: Aperture, mask: BoolArray
 ) -> tuple[FloatArray, PixelQuadrature]:
-    """(rows, cols) intensity averaged over pixels' apertures, and how; ``mask``: material."""
+    """(rows, cols) intensity averaged over apertures, and the rule; ``mask``: True on material."""
     near = near_edges(mask, aperture.reach_px)
     inside = mask & ~near
     image = np.full(mask.shape, state.background)
@@ -60,7 +60,7 @@ def integrate(
 
 
 def near_edges(mask: BoolArray, reach_px: int) -> BoolArray:
-    """(rows, cols) True where material and background both lie within reach, rows or columns."""
+    """(rows, cols) True if material and background both lie within ``reach_px`` of the pixel."""
     size = 2 * reach_px + 1
     dilated = ndimage.maximum_filter(mask, size, mode="nearest")
     eroded = ndimage.minimum_filter(mask, size, mode="nearest")
@@ -70,13 +70,13 @@ def near_edges(mask: BoolArray, reach_px: int) -> BoolArray:
 def points_a_side(
     aperture: Aperture, pattern: SpeckleSpec, compression: float = 1.0
 ) -> tuple[int, float]:
-    """How many points a side the Gauss rule needs, and the bound of its rms error.
+    """Number of points of the Gauss rule along each axis, and the bound of its rms error.
 
     A plane wave of the pattern appears at up to ``compression`` times its frequency f. The rule
-    multiplies it by one factor, the exact average by another; by Parseval's theorem the rms
-    error is at most the largest of |difference of factors| times the blur's transfer function
-    at f, times the standard deviation of the pattern before its blur. The least number of
-    points is taken for which that is below TOLERANCE, but at most 16.
+    multiplies it by one factor, the exact average by another. By Parseval's theorem the rms
+    error is at most max over f of |difference of the factors| times the blur's transfer function
+    at f, times the standard deviation of the pattern before its blur. The rule has the fewest
+    points for which this bound is below TOLERANCE, but at most 16.
     """
     f = np.linspace(0.0, 0.5, 257)
     blur = np.exp(-2.0 * (np.pi * pattern.blur_px * f) ** 2)
@@ -95,22 +95,22 @@ def points_a_side(
 
 @dataclass(frozen=True, kw_only=True)
 class ImageRecord:
-    """What the sidecar of a set says of an image."""
+    """Record of an image in the set's ``images.json``."""
 
     image: str
     camera_image: str
     mask: str
-    """Files of the image without noise, of the one as exposed, and of where there is material."""
+    """File names of the noise-free image, of the exposed one, and of the mask of material."""
     noise_sd: float
     """Rms of the camera image's predicted noise on the material [fraction of full scale]."""
     saturated_px: int
-    """Material pixels at the highest level."""
+    """Number of material pixels at the highest grey level."""
     doubly_covered_px: int
-    """Pixels inside more than one element, where the specimen overlaps."""
+    """Number of pixels inside more than one element, where the specimen overlaps itself."""
     light: float | None = None
-    """Factor on the irradiance; None if the light doesn't flicker."""
+    """Factor on the irradiance [-]; None without flicker."""
     quadrature: PixelQuadrature | None = None
-    """How the pixels were averaged; None if they show points."""
+    """How the pixels were averaged; None if each pixel samples a point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class Camera:
 
     spec: ImagingSpec
     points: Positions | None
-    """The ideal ones that pixels show; None without a lens."""
+    """Ideal positions (row, col) that the pixels show [px]; None without a lens."""
     folder: Path
 
     @classmethod
@@ -131,7 +131,7 @@ class Camera:
     def expose(
         self, ideal: Rendering, state: ImagedState, name: str, mask_name: str
     ) -> ImageRecord:
-        """Write what the camera makes of a scene, of which a perfect lens shows ``ideal``.
+        """Image a state and write the files; ``ideal`` is its rendering by a perfect lens.
 
         The image's ``name`` also seeds noise and flicker.
         """

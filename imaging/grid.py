@@ -1,4 +1,4 @@
-"""Pixels and millimetres: the one place where the y axis is flipped.
+"""Conversion of pixels and millimetres: the only place where the y axis is flipped.
 
 Physical frame: x right, y up, in mm. Image frame: column right, row *down*, in px, whole
 numbers at pixel centres. Displacements everywhere in the project are components along the
@@ -38,7 +38,7 @@ class PixelGrid:
 
     @classmethod
     def centred(cls, rows: int, cols: int, pixel_size: float) -> PixelGrid:
-        """Make the grid whose image centre is the physical origin."""
+        """Make the grid whose image centre is at the physical origin."""
         x0, y0 = -0.5 * (cols - 1) * pixel_size, 0.5 * (rows - 1) * pixel_size
         return cls(rows, cols, pixel_size, x0, y0)
 
@@ -76,7 +76,7 @@ class PixelGrid:
         return np.asarray(row), np.asarray(col)
 
     def binned(self, factor: int) -> PixelGrid:
-        """Join blocks of ``factor`` x ``factor`` pixels; incomplete blocks are dropped."""
+        """The grid of blocks of ``factor`` x ``factor`` pixels; incomplete blocks are dropped."""
         rows, cols, h = self.rows // factor, self.cols // factor, self.pixel_size * factor
         shift = 0.5 * (factor - 1) * self.pixel_size
         return PixelGrid(rows, cols, h, self.x0 + shift, self.y0 - shift)

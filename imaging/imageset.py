@@ -1,4 +1,4 @@
-"""Benchmark images with certified truth: a folder that any DIC code can be scored on.
+"""Benchmark images with certified ground truth: a folder on which any DIC code can be scored.
 
 ::
 
@@ -7,20 +7,20 @@
     images.json
 
 The number in a file's name is the nominal strain in hundredths of a percent (0780 is 7.80 %).
-The plain images are noise-free averages over the pixels in float32; those with the bits in their
-name are single exposures by the sensor: noise, saturation, rounding. ``images.json`` says how the
-set was made and is written last: without it, the set isn't finished. Files are compared with the
-SHA-256 in it when they are read. It also holds what makes the set anew, and:
+The plain images are noise-free averages over the pixels in float32. Images with a bit depth in
+their name are single exposures by the sensor: with noise, saturation, rounding. ``images.json``
+says how the set was made and is written last: without it, the set isn't finished. Files are checked
+against its SHA-256 sums when read. It also holds the options to reproduce the set, and:
 
 ``noise``
     Predicted ``variance = constant + slope * (grey - offset)`` [fraction of full scale, squared].
 ``reference``, ``snapshots``
-    An ``ImageRecord``, and a ``SnapshotRecord`` of each deformed image.
+    An ``ImageRecord``, and a ``SnapshotRecord`` for each deformed image.
 ``warnings``
-    Sentences about what makes the images other than what a camera would show.
+    Texts about differences of the images from those a real camera would take.
 
-With a distortion of the lens, images and masks are as the lens shows them, and the truth
-(:mod:`modeharvest.imaging.pair`) is on the ideal grid: what is measured in undistorted images.
+With lens distortion, images and masks are distorted, and the truth
+(:mod:`modeharvest.imaging.pair`) is on the ideal grid, where undistorted images are measured.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ FORMAT = "modeharvest-images-1"
 
 
 def image_key(solution: Solution, spec: ImagingSpec, strains: Sequence[float]) -> str:
-    """Digest everything that images of these nominal strains [-] depend on, hexadecimal.
+    """Hexadecimal digest of everything that images at these nominal strains [-] depend on.
 
     InputError if a snapshot is missing, or a distortion's file can't be read.
     """
@@ -65,7 +65,7 @@ def image_key(solution: Solution, spec: ImagingSpec, strains: Sequence[float]) -
              "element": solution.mesh.element, "strains": [float(s) for s in strains]}  # fmt: skip
     digest.update(json.dumps(parts, sort_keys=True).encode())
     if isinstance(spec.distortion, str):
-        read_distortion(spec.distortion)  # says what is wrong with it
+        read_distortion(spec.distortion)  # raises InputError if the file is invalid
         digest.update(sha256_of(spec.distortion).encode())
     for array in (solution.mesh.nodes, solution.mesh.cells):
         digest.update(array.tobytes())
@@ -76,28 +76,28 @@ def image_key(solution: Solution, spec: ImagingSpec, strains: Sequence[float]) -
 
 SIDECAR = "images.json"
 _LIBRARIES = ("numpy", "scipy", "numba", "finufft", "h5py", "tifffile")
-"""What the pixels depend on."""
+"""Libraries whose versions are recorded: the pixels depend on them."""
 _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*.h5")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotRecord(ImageRecord):
-    """What the sidecar says of a deformed image."""
+    """Record of a deformed image in the set's ``images.json``."""
 
     nominal_strain: float
     branch: str
-    """Of the snapshot; the strain [-]."""
+    """Nominal strain [-] and branch of the snapshot."""
     truth: str
-    """Name of the truth's file."""
+    """Name of the truth file."""
     inverse_map_max_residual_px: float
     """Largest residual of the inverse mapping [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSet:
-    """A finished set on disk.
+    """A finished image set on disk.
 
-    Images and truth are read when asked for: InputError if a file is not what was written.
+    Images and truth are read on access: InputError if a file's SHA-256 has changed.
     """
 
     folder: Path
@@ -143,7 +143,7 @@ class ImageSet:
 
     @property
     def max_residual_px(self) -> float:
-        """The largest residual of the inverse mapping in the whole set [px]."""
+        """Largest residual of the inverse mapping in the whole set [px]."""
         return float(self.info["inverse_map_max_residual_px"])
 
     def reference(self, *, camera: bool = False) -> FloatImage:
@@ -169,45 +169,45 @@ class ImageSet:
         return ImagePair(f, g, self.grid, *masks, self.truth(strain), strain)
 
     def __iter__(self) -> Iterator[ImagePair]:
-        """The pairs of the set without noise, each read when it is its turn."""
+        """The noise-free image pairs of the set, each read when it is reached."""
         return map(self.pair, self.strains)
 
     def noise_sd(self, strain: float | None = None) -> FloatArray:
         """(rows, cols) predicted standard deviation of a camera image [fraction of full scale].
 
-        ``strain`` names a deformed image, None the reference image.
+        ``strain``: nominal strain of the deformed image; None for the reference image.
         """
         mean = self.reference() if strain is None else self.deformed(strain)
         return np.sqrt(self.spec.sensor.noise_variance(mean, self.spec.bits))
 
     def truth(self, strain: float) -> Truth:
-        """The truth behind the deformed image at a nominal strain [-]; read when asked for."""
+        """The truth of the deformed image at a nominal strain [-]; read on access."""
         name = self._snapshot(strain).truth
         return Truth(lambda part: Truth.read(self._whole(name)).part(part))
 
     @property
     def digests(self) -> dict[str, str]:
-        """SHA-256 of every file but the sidecar, by their names."""
+        """SHA-256 of every file except ``images.json``, by file name."""
         return {name: str(entry["sha256"]) for name, entry in self.info["files"].items()}
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Every file of the set, the sidecar last."""
+        """Every file of the set, ``images.json`` last."""
         return (*(self.folder / name for name in self.digests), self.folder / SIDECAR)
 
     def is_whole(self) -> bool:
-        """Whether every file is what was written, by its SHA-256."""
+        """Whether every file still has the SHA-256 it was written with."""
         return all(sha256_of(self.folder / name) == s for name, s in self.digests.items())
 
     def _image(self, record: ImageRecord, camera: bool) -> FloatImage:
         image = read_image(self._whole(record.camera_image if camera else record.image))
-        if camera:  # a 12-bit camera's white is 4095, which the file's 16 bits don't know
+        if camera:  # white of a 12-bit camera is 4095, not the file's 65535
             full_scale = 255.0 if self.spec.bits <= 8 else 65535.0
             image *= np.float32(full_scale / (2**self.spec.bits - 1))
         return image
 
     def _whole(self, name: str) -> Path:
-        """The path of a file; InputError unless its SHA-256 is the one it was written with."""
+        """Path of a file; InputError unless it has the SHA-256 it was written with."""
         path = self.folder / name
         if sha256_of(path) != self.digests[name]:
             raise InputError(
@@ -227,7 +227,7 @@ class ImageSet:
 
 
 def is_complete(folder: Path | str, key: str) -> bool:
-    """Whether ``folder`` holds a whole set of that key (:func:`image_key`)."""
+    """Whether ``folder`` holds a complete set with this key (:func:`image_key`)."""
     try:
         found = ImageSet.read(folder)
     except InputError:
@@ -242,15 +242,15 @@ def make_images(
     strains: Sequence[float] | None = None,
     progress: Progress = silent,
 ) -> ImageSet:
-    """Make (or find finished) the images and the truth of some snapshots.
+    """Make the images and the truth of some snapshots, or open the set if it already exists.
 
-    InputError if a snapshot is missing, an element is turned inside out, two strains would share a
-    file name, or the disk refuses.
+    InputError if a snapshot is missing, an element is inverted, two strains would have the same
+    file name, or a file can't be written.
 
     solution, spec : what is imaged, and how.
-    folder : where to write; made if it doesn't exist. A whole set of the same solution, spec,
-        strains and code is left as it is; any other set there is replaced.
-    strains : nominal strains of the snapshots to image [-]; by default those of all.
+    folder : where to write; made if it doesn't exist. A complete set with the same solution, spec,
+        strains and code is kept; any other set there is replaced.
+    strains : nominal strains of the snapshots to image [-]; by default all.
     """
     folder = Path(folder)
     if strains is None:
@@ -261,7 +261,7 @@ def make_images(
     key = image_key(solution, spec, strains)
     if is_complete(folder, key):
         return ImageSet.read(folder)
-    (folder / SIDECAR).unlink(missing_ok=True)  # first: the mark that a set is complete
+    (folder / SIDECAR).unlink(missing_ok=True)  # first: this file marks a set as complete
     for path in (path for pattern in _OWN_FILES for path in folder.glob(pattern)):
         path.unlink(missing_ok=True)
     info, names = _write_set(solution, strains, spec, folder, progress)
@@ -275,7 +275,7 @@ def make_images(
 def _write_set(
     solution: Solution, strains: Sequence[float], spec: ImagingSpec, folder: Path, report: Progress
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write all files but the sidecar; its content, and the files' names."""
+    """Write all files except ``images.json``; return its content and the files' names."""
     steps, mesh = 1 + len(strains), solution.mesh
     report(0, steps, "images: reference")
     grid = choose_grid(solution, strains, spec)
@@ -317,7 +317,7 @@ def _write_set(
 def _write_snapshot(
     camera: Camera, state: ImagedState, snapshot: Snapshot, strain: float, located: Located
 ) -> SnapshotRecord:
-    """Write one deformed image, its mask and its truth; ``located`` is the reference's."""
+    """Write a deformed image, its mask and its truth; ``located``: of the reference image."""
     ideal, truth = render_deformed(state, located)
     name, truth_name = f"deformed_{_label(strain)}", f"truth_{_label(strain)}.h5"
     record = camera.expose(ideal, state, name, f"{name}_mask.tif")

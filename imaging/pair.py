@@ -41,12 +41,12 @@ _PARTS = {
     "residual_px": ("px", "residual of the inverse mapping at the deformed image's pixels"),
 }
 _TYPES = {"element": np.int32, "deformed_displacement": np.float32, "residual_px": np.float32}
-"""Of the parts that aren't float64."""
+"""Types of the arrays that aren't float64."""
 _CHUNK_ROWS = 64
 
 
 class HasDisplacement(Protocol):
-    """A measurement: anything that gives a displacement at pixels."""
+    """A measurement: any object that gives a displacement field at pixels."""
 
     def displacement(self, grid: PixelGrid, /) -> FloatArray:
         """(rows, cols, 2) u [mm] at the pixels of a grid."""
@@ -54,23 +54,23 @@ class HasDisplacement(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a measurement of one deformed image should find; each part is made when asked for.
+    """The exact fields of one deformed image; each part is read or computed on access.
 
     The last axis of length 2 holds the components (x, y) along the physical axes; NaN where there
     is no material.
     """
 
     part: Callable[[str], NDArray[Any]]
-    """Gives a part by the name of its property."""
+    """Returns a part, given the name of its property."""
 
     @classmethod
     def of(cls, **parts: NDArray[Any]) -> Truth:
-        """A truth in memory, or such parts of it as are known."""
+        """A truth in memory, from the parts that are known."""
         return cls(parts.__getitem__)
 
     @classmethod
     def read(cls, path: Path | str) -> Truth:
-        """A truth in a file; a part raises InputError if the file is missing or cut short."""
+        """A truth in a file; access raises InputError if the file is missing or cut short."""
         return cls(partial(_read_part, path))
 
     @cached_property
@@ -80,7 +80,7 @@ class Truth:
 
     @cached_property
     def reference_point(self) -> FloatArray:
-        """(rows, cols, 2) X of the material that the *deformed* image's pixels show [mm]."""
+        """(rows, cols, 2) reference position X of the *deformed* image's pixels [mm]."""
         return self.part("reference_point")
 
     @cached_property
@@ -99,7 +99,7 @@ class Truth:
         return self.part("residual_px")
 
     def write(self, path: Path | str, nominal_strain: float, grid: PixelGrid) -> None:
-        """Write a truth file, whole or not at all."""
+        """Write a truth file atomically."""
         with atomic_hdf5(path) as file:
             file.attrs.update(format=TRUTH_FORMAT, nominal_strain=nominal_strain, **asdict(grid))
             for name, (unit, meaning) in _PARTS.items():
@@ -112,7 +112,7 @@ class Truth:
 
 
 def _read_part(path: Path | str, name: str) -> NDArray[Any]:
-    """One of a truth file's arrays, components last."""
+    """Read an array of a truth file, components last."""
     remedy = "make it again with 'modeharvest image'"
     with open_hdf5(path, "a truth file (HDF5)", remedy, TRUTH_FORMAT) as file:
         plane = np.asarray(file[name], dtype=_TYPES.get(name, np.float64))
@@ -124,25 +124,25 @@ def _read_part(path: Path | str, name: str) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
-    """A reference and a deformed image of one size; checked, and read-only.
+    """A reference and a deformed image of the same size; checked, and read-only.
 
-    InputError if sizes differ, a mask is empty, or an image has NaN or one level on its material.
+    InputError if sizes differ, a mask is empty, or an image has NaN or only one level on material.
     """
 
     reference: FloatImage
     deformed: FloatImage
-    """(rows, cols) grey levels f and g; kept as float32."""
+    """(rows, cols) grey levels f and g; stored as float32."""
     grid: PixelGrid
-    """Their pixels."""
+    """The pixel grid of both images."""
     mask: BoolArray | None = None
     deformed_mask: BoolArray | None = None
     """(rows, cols) True on material, in f and in g; None for everywhere."""
     truth: Truth | None = None
-    """What a measurement should find, where that is known."""
+    """The exact fields, if known."""
     strain: float = math.nan
-    """Nominal strain of the deformed image [-]; NaN where it isn't known."""
+    """Nominal strain of the deformed image [-]; NaN if unknown."""
     is_plain: bool = False
-    """Whether only the material's contours count: it may have one grey level."""
+    """Whether only the material's contours are used: the material may have one grey level."""
 
     def __post_init__(self) -> None:
         for name in ("reference", "deformed"):
@@ -156,22 +156,22 @@ class ImagePair:
 
     @property
     def grey(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The grey levels of the material, of f and of g."""
+        """The grey levels of f and of g on the material, (n,) with a mask."""
         f, g = self.reference, self.deformed
         return grey_levels_in(f, self.mask), grey_levels_in(g, self.deformed_mask)
 
     @property
     def masks(self) -> tuple[BoolArray, BoolArray]:
-        """(rows, cols) True on material, of f and of g; everywhere where there is no mask."""
+        """(rows, cols) True on material, of f and of g; all True without a mask."""
         everywhere, f, g = np.ones(self.grid.shape, np.bool_), self.mask, self.deformed_mask
         return everywhere if f is None else f, everywhere if g is None else g
 
     def with_images(self, reference: NDArray[Any], deformed: NDArray[Any]) -> ImagePair:
-        """The same pair with other grey levels: noisy, blurred."""
+        """The same pair with other grey levels, for example noisy or blurred ones."""
         return replace(self, reference=reference, deformed=deformed)
 
     def rms(self, measured: HasDisplacement) -> float:
-        """Rms of truth - measured *per component* on material [mm]; InputError without a truth."""
+        """Rms *per component* of truth - measured on material [mm]; InputError without a truth."""
         if self.truth is None:
             raise InputError("expected a pair whose true displacement is known, got one without")
         error = self.truth.displacement - measured.displacement(self.grid)
@@ -179,7 +179,7 @@ class ImagePair:
 
 
 def grey_levels_in(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:
-    """The grey levels that a mask leaves."""
+    """The grey levels where the mask is True; the whole image without a mask."""
     return image if mask is None else image[mask]
 
 
@@ -215,6 +215,6 @@ def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArra
 
 
 def location_of(bad: BoolArray) -> str:
-    """How many pixels are bad, and where the first one is."""
+    """Text: the number of bad pixels and the position of the first one."""
     row, col = np.unravel_index(int(np.argmax(bad)), bad.shape)
     return f"{int(bad.sum())} px, the first at row {row}, column {col}"

@@ -1,12 +1,12 @@
-"""Images of a deforming specimen, and the truth behind them.
+"""Images of a deforming specimen, and their exact displacement fields.
 
 The reference image shows the speckle itself. A pixel x of a deformed image shows the speckle at its
 reference point X, with X + u(X) = x solved by the inverse isoparametric mapping, so neither image
-is interpolated from the other. Through a lens a pixel p shows the ideal point phi_S^-1(p): that is
-found exactly, then the material there and its reference point. No image is resampled.
+is interpolated from the other. Through a lens a pixel p shows the ideal point phi_S^-1(p), which is
+found exactly; then the material there and its reference point are found. No image is resampled.
 
-Averages over pixels are made in passes over the image's rows: a thread takes a band of rows at a
-time, whose mapping fits into its cache; of the whole image nothing is kept but grey levels.
+Averages over pixels are computed band by band: each thread processes a band of rows at a time,
+whose mapping fits into its cache. For the whole image only grey levels are kept.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ _BAND = 16  # rows that a thread averages at a time
 
 @dataclass(frozen=True, eq=False)
 class ImagedState:
-    """A state of the specimen before a camera."""
+    """A state of the specimen to be imaged."""
 
     mesh: Mesh
-    """Undeformed."""
+    """The undeformed mesh."""
     displacement: FloatArray | None
-    """(n, 2) at its nodes [mm]; None for the undeformed state."""
+    """(n, 2) nodal displacement [mm]; None for the undeformed state."""
     grid: PixelGrid
-    """The pixels; the speckle's whole pixels are the grid's."""
+    """The pixel grid, of the image and of the speckle."""
     speckle: Speckle
     background: float
-    """Intensity of the material and around it [fraction of full scale]."""
+    """Pattern on the material, and intensity around it [fraction of full scale]."""
     where: str = "mesh"
-    """What to call the state in an error."""
+    """Name of the state in error messages."""
 
     @property
     def nodes(self) -> FloatArray:
-        """(n, 2) where the nodes are in this state [mm]."""
+        """(n, 2) node positions in this state [mm]."""
         return self.mesh.nodes if self.displacement is None else self.mesh.nodes + self.displacement
 
     @property
     def compression(self) -> float:
-        """How many times a length shrinks, at most, among the elements' centres [-]."""
+        """Largest factor by which lengths shrink at an element centre: 1 / least stretch [-]."""
         if self.displacement is None:
             return 1.0
         mesh = self.mesh
@@ -67,15 +67,15 @@ class ImagedState:
         return float(1.0 / stretches.min())
 
     def average(self, offsets: FloatArray, weights: FloatArray, selected: BoolArray) -> FloatArray:
-        """(k,) weighted sum of the intensities at the k selected pixels moved by each offset.
+        """(k,) weighted sum over offsets of the intensities at the k selected pixels + offset.
 
-        ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
+        ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inverted.
         """
         mesh, nodes, grid, h = self.mesh, self.nodes, self.grid, self.grid.pixel_size
         require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
         cells = mesh.cells[self._reaching(nodes, selected, float(np.abs(offsets).max(initial=0.0)))]
         position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)
-        samples = self.speckle.spec.binary_field.finer * position  # of which the spline is
+        samples = self.speckle.spec.binary_field.finer * position  # coordinates of the spline
         place, pattern = polynomials(mesh.element, cells, samples), self.speckle.spline.table
         selected = np.ascontiguousarray(selected)
         chosen = np.flatnonzero(selected)
@@ -90,7 +90,7 @@ class ImagedState:
         return total
 
     def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
-        """(m,) True for elements that may hold a point within ``reach`` px of a selected pixel."""
+        """(m,) True for elements that may have points within ``reach`` px of a selected pixel."""
         element, shape = reference_element(self.mesh.element), self.grid.shape
         control = bezier_matrix(element.triangular) @ element.coefficients
         position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
@@ -106,29 +106,29 @@ class ImagedState:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """An image, and where it shows material."""
+    """An image and its mask of material."""
 
     image: FloatImage
     """(rows, cols) float32 intensity [fraction of full scale]."""
     mask: BoolArray
     """(rows, cols) True where there is material."""
     doubly_covered: int = 0
-    """How many of its pixels lie inside more than one element: the specimen overlaps there, and the
-    element of the lowest number is shown."""
+    """Number of pixels inside more than one element: the specimen overlaps itself there, and the
+    element with the lowest number is shown."""
 
 
 def render_reference(state: ImagedState, located: Located) -> Rendering:
-    """Show the undeformed specimen, ``located`` on the state's grid: speckle at whole pixels."""
+    """Render the undeformed specimen; ``located``: its mesh on the state's grid."""
     mask = located.mask
     image = np.where(mask, state.speckle.image(), state.background).astype(np.float32)
     return Rendering(image, mask, located.doubly_covered)
 
 
 def render_deformed(state: ImagedState, located_reference: Located) -> tuple[Rendering, Truth]:
-    """Show the deformed specimen, and give the truth behind the image.
+    """Render the deformed specimen, and compute the image's exact fields.
 
     ``located_reference`` is the undeformed mesh on the same grid. InputError if the displacement
-    turns an element inside out.
+    inverts an element.
     """
     mesh, grid, u = state.mesh, state.grid, state.displacement
     assert u is not None
@@ -150,10 +150,10 @@ def render_deformed(state: ImagedState, located_reference: Located) -> tuple[Ren
 
 
 def render_observed(state: ImagedState, points: Positions) -> Rendering:
-    """Show the specimen at given ideal positions instead of at the grid's pixels.
+    """Render the specimen at given ideal positions instead of at the grid's pixels.
 
-    ``points`` are (row, col), each (rows, cols) [px]; pixels that lie inside more than one
-    element are not counted. InputError if the displacement turns an element inside out.
+    ``points`` are (row, col), each (rows, cols) [px]. Pixels inside more than one element are not
+    counted. InputError if the displacement inverts an element.
     """
     mesh, grid = state.mesh, state.grid
     located = locate_points(state.nodes, mesh.cells, mesh.element, grid, *points, state.where)
@@ -174,10 +174,10 @@ def _add(
     start: IntArray, visits: IntArray, weight: float, selected: BoolArray, chosen: IntArray,
     first: IntArray, total: FloatArray, thread: int, threads: int,
 ) -> None:  # fmt: skip
-    """Add a weight times the selected pixels' grey levels to ``total`` (k,).
+    """Add ``weight`` times the selected pixels' grey levels to ``total`` (k,).
 
-    ``place`` (m, 2, 9): where in the pattern, (row, col) [samples], the elements' points are.
-    ``chosen`` (k,) are the numbers of the selected pixels, those of band b from ``first[b]`` on.
+    ``place`` (m, 2, 9): polynomials of the position in the pattern, (row, col) [samples].
+    ``chosen`` (k,): flat indices of the selected pixels, those of band b from ``first[b]`` on.
     """
     rows, cols = selected.shape
     where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)

@@ -1,22 +1,22 @@
 """A camera's sensor: its aperture, its response and its noise.
 
-A pixel that receives the irradiance I (its aperture's average; 1 is white) puts out
+The output of a pixel that receives the irradiance I (averaged over its aperture; 1 is white) is
 
     y = gain * Poisson(full_well * I) / full_well + offset + read_noise * N(0, 1),
 
-cut off at 0 and at ``saturation`` and rounded to one of 2^bits levels: the linear model of EMVA
+clipped at 0 and at ``saturation`` and rounded to one of 2^bits levels: the linear model of EMVA
 Standard 1288 (Release 4.0 Linear, European Machine Vision Association 2021). All grey levels are
-fractions of full scale. Before the cut-off the variance of a grey level whose mean is y is
+fractions of full scale. Before clipping, a grey level with mean y has the variance
 
     sigma^2(y) = read_noise^2 + gain (y - offset) / full_well + q^2 / 12,   q = 1 / (2^bits - 1).
 
-Everything is off by default: points instead of areas, no noise, gain 1 and offset 0.
+By default, pixels sample points instead of areas, without noise, with gain 1 and offset 0.
 
-A pixel at x averages its sensitive area behind the blur of the lens, ``integral h(t) I(x + t) dt``
+A pixel at x averages over its sensitive area and the lens's blur, ``integral h(t) I(x + t) dt``,
 with h the indicator of a centred square convolved with a Gaussian. In Fourier space h is
-``sinc(a f_row) sinc(a f_col) exp(-2 pi^2 s^2 |f|^2)``, which is exact on the reference image's
-pattern. A deformed pattern is no sum of plane waves: there the average is a Gauss rule whose
-weight is h itself, and equally weighted points where the edge of the material makes I jump.
+``sinc(a f_row) sinc(a f_col) exp(-2 pi^2 s^2 |f|^2)``, which is exact for the reference image's
+pattern. A deformed pattern is no sum of plane waves: there the average is a Gauss rule with weight
+h, or the mean of equally weighted points where I jumps at the edge of the material.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from modeharvest.util.errors import InputError, require_within
 
 
 def quantise(image: NDArray[Any], bits: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Grey levels as a camera stores them: 0 ... 1 clipped, times 2^bits - 1, rounded to nearest.
+    """Grey levels as a camera stores them: clipped to 0 ... 1, times 2^bits - 1, rounded.
 
-    Up to 8 bits give uint8, up to 16 uint16; InputError for other bits.
+    The type is uint8 for up to 8 bits, uint16 for up to 16; InputError for other bits.
     """
     if not 1 <= bits <= 16:
         raise InputError(f"expected 1 to 16 bits, got {bits}")
@@ -50,18 +50,18 @@ def quantise(image: NDArray[Any], bits: int) -> NDArray[np.uint8] | NDArray[np.u
 EDGE_POINTS = 233  # a Fibonacci number
 _GOLDEN = 0.5 * (1.0 + math.sqrt(5.0))
 _FINE = 64  # nodes for each of the two convolved parts of h
-_THIN = 1e-6  # px: as good as a point
-_TAIL = 5.0  # standard deviations of the blur; 6e-7 of it lie beyond
+_THIN = 1e-6  # px: width below which h is treated as a point
+_TAIL = 5.0  # standard deviations of the blur; a fraction of 6e-7 lies beyond
 
 
 @dataclass(frozen=True)
 class Aperture:
-    """The weight h with which a pixel averages light; InputError if a value is out of its range."""
+    """The weight h with which a pixel averages light; InputError if a value is out of range."""
 
     fill_factor: float = 0.0
-    """Sensitive part of the pixel's area [-], a centred square; 0 is a point."""
+    """Sensitive fraction of the pixel's area, 0 to 1 [-], a centred square; 0 is a point."""
     psf_px: float = 0.0
-    """Standard deviation of the lens's Gaussian point spread [px]; 0 is a perfect lens."""
+    """Standard deviation of the lens's Gaussian point spread, 0 to 2 [px]; 0: perfect lens."""
 
     def __post_init__(self) -> None:
         require_within("sensor: expected a fill factor", self.fill_factor, 0.0, 1.0)
@@ -69,7 +69,7 @@ class Aperture:
 
     @property
     def is_point(self) -> bool:
-        """Whether pixels show single points, so that there is nothing to average."""
+        """Whether pixels sample single points, without averaging."""
         return self.fill_factor == 0.0 and self.psf_px == 0.0
 
     @property
@@ -79,7 +79,7 @@ class Aperture:
 
     @property
     def reach_px(self) -> int:
-        """How many whole pixels away, along rows or columns, the weight is negligible."""
+        """Distance, along rows or columns, beyond which the weight is negligible [px]."""
         return math.ceil(0.5 * self.side_px + _TAIL * self.psf_px)
 
     def transfer(self, f: ArrayLike) -> FloatArray:
@@ -91,7 +91,7 @@ class Aperture:
     def rule(self, points: int) -> tuple[FloatArray, FloatArray]:
         """Gauss rule for the weight h along one axis: (nodes [px], weights), each (points,).
 
-        With a perfect lens it is the Gauss-Legendre rule, with a fill factor of 0 Gauss-Hermite.
+        For a perfect lens this is the Gauss-Legendre rule, for a fill factor of 0 Gauss-Hermite.
         """
         x, v = np.polynomial.legendre.leggauss(_FINE)
         y, w = np.polynomial.hermite_e.hermegauss(_FINE)
@@ -107,16 +107,16 @@ class Aperture:
         return found, vectors[0] ** 2
 
     def scattered(self, points: int = EDGE_POINTS) -> FloatArray:
-        """(points, 2) offsets (row, col) [px], all of the same weight, that sample h evenly.
+        """(points, 2) offsets (row, col) [px] of equal weight that sample h evenly.
 
-        A Fibonacci lattice put through the inverse of h's cumulative sum: no two points share
-        a row or a column, so an edge along the pixels is resolved as finely as any other. The
-        part of a pixel that a straight edge cuts off is off by 0.0047 rms for 233 points.
+        A Fibonacci lattice mapped by the inverse cumulative distribution of h. No two points
+        share a row or a column, so an edge along the pixels is resolved as finely as any other.
+        The error of the fraction of a pixel cut off by a straight edge is 0.0047 rms (233 points).
         """
         a, s = max(self.side_px, _THIN), max(self.psf_px, _THIN)
         t = np.linspace(-1.0, 1.0, 20_001) * (0.5 * a + 6.0 * s)
         high, low = (t + 0.5 * a) / s, (t - 0.5 * a) / s
-        # The normal distribution's cumulative one, integrated: z ndtr(z) + exp(-z^2 / 2) / ...
+        # Integral of the normal cumulative distribution: z ndtr(z) + exp(-z^2 / 2) / ...
         bell = (np.exp(-0.5 * high**2) - np.exp(-0.5 * low**2)) / math.sqrt(2.0 * math.pi)
         upto = s / a * (high * ndtr(high) - low * ndtr(low) + bell)
         k = np.arange(points)
@@ -126,31 +126,31 @@ class Aperture:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How a sensor turns light into grey levels; InputError if a value is out of its range."""
+    """Conversion of light into grey levels; InputError if a value is out of range."""
 
     fill_factor: float = 0.0
     psf_px: float = 0.0
-    """As of an :class:`Aperture`."""
+    """Fill factor and point spread, as for :class:`Aperture`."""
     gain: float = 1.0
     """Factor from irradiance to grey level [-]."""
     offset: float = 0.0
-    """Grey level of the dark [fraction of full scale]."""
+    """Grey level without light [fraction of full scale]."""
     full_well: float = 0.0
-    """Electrons that an irradiance of 1 frees [-]; the fewer, the more noise; 0: none."""
+    """Electrons at irradiance 1 [-]; fewer electrons give more shot noise; 0: no shot noise."""
     read_noise: float = 0.0
     """Standard deviation of the read noise [fraction of full scale]."""
     saturation: float = 1.0
-    """Grey level that is never exceeded [fraction of full scale]."""
+    """Largest grey level, at which the sensor clips [fraction of full scale]."""
     shot_seed: int = 0
     read_seed: int = 0
-    """Of the shot and of the read noise; every image of a set has streams of its own."""
+    """Seeds of shot noise and read noise; every image of a set has independent noise."""
     flicker: float = 0.0
-    """Relative standard deviation of the light from image to image [-], even over an image."""
+    """Relative standard deviation of the illumination between images [-]; uniform in each image."""
     flicker_seed: int = 0
-    """Of the flicker, likewise."""
+    """Seed of the flicker; every image of a set has an independent value."""
 
     def __post_init__(self) -> None:
-        _ = self.aperture  # checks fill factor and point spread
+        _ = self.aperture  # validates fill factor and point spread
         require_within("sensor: expected a gain", self.gain, 0.0, above=True)
         require_within("sensor: expected an offset", self.offset, -1.0, 1.0, above=True)
         if not (self.full_well == 0.0 or 1.0 <= self.full_well <= 1e12):
@@ -164,29 +164,29 @@ class Sensor:
 
     @property
     def aperture(self) -> Aperture:
-        """What a pixel averages."""
+        """The weight with which a pixel averages light."""
         return Aperture(self.fill_factor, self.psf_px)
 
     def illumination(self, name: str) -> float:
-        """Factor on an image's irradiance, 1 on average, by its name in its set."""
+        """Flicker factor on the irradiance of the image ``name``: log-normal with median 1 [-]."""
         draw = stream(self.flicker_seed, "flicker", name).standard_normal()
         return float(np.exp(self.flicker * draw))
 
     def mean(self, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Grey levels without noise, cut-off and rounding [fraction of full scale]."""
+        """Grey levels without noise, clipping and rounding [fraction of full scale]."""
         return np.asarray(self.gain * irradiance + self.offset, dtype=np.float32)
 
     def expose(
         self, irradiance: NDArray[np.float32], bits: int, name: str
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """One exposure of averages over the pixels (rows, cols): noise, cut-off and rounding.
+        """One exposure of the pixels' irradiance (rows, cols): noise, clipping and rounding.
 
-        The noise follows from the seeds and the image's ``name``: no two images of a set share it.
+        The seeds and the image's ``name`` determine the noise, which differs between images.
         """
         return quantise(np.minimum(self.noisy(irradiance, name), self.saturation), bits)
 
     def noisy(self, irradiance: NDArray[np.float32], name: str) -> NDArray[np.floating]:
-        """Grey levels with noise, before cut-off and rounding [fraction of full scale]."""
+        """Grey levels with noise, before clipping and rounding [fraction of full scale]."""
         grey: NDArray[np.floating] = self.mean(irradiance)
         if self.full_well > 0.0:
             electrons = self.full_well * np.maximum(irradiance.astype(np.float64), 0.0)
@@ -198,9 +198,9 @@ class Sensor:
         return grey
 
     def noise_variance(self, grey: ArrayLike, bits: int) -> FloatArray:
-        """Predicted variance of a camera's grey level of that mean, both as fractions.
+        """Predicted variance of a grey level with mean ``grey`` [fraction of full scale, squared].
 
-        The cut-off, which lowers it, is left out; rounding counts as white noise.
+        Clipping, which lowers the variance, is neglected; rounding counts as white noise.
         """
         constant, slope = self.noise_model(bits)
         above = np.maximum(np.asarray(grey, dtype=np.float64) - self.offset, 0.0)
@@ -213,11 +213,11 @@ class Sensor:
         return self.read_noise**2 + rounding, slope
 
     def saturated(self, levels: NDArray[np.uint8] | NDArray[np.uint16], bits: int) -> int:
-        """Count the pixels of an exposure at its highest level."""
+        """Number of pixels of an exposure at its highest level."""
         top = quantise(np.array(self.saturation), bits)
         return int(np.count_nonzero(levels >= top))
 
 
 def stream(seed: int, kind: str, name: str) -> np.random.Generator:
-    """Random numbers of a kind of noise in the image of that name."""
+    """Random generator for one kind of noise in the image with a given name."""
     return np.random.default_rng([seed, zlib.crc32(f"{kind} noise of {name}".encode())])

@@ -1,4 +1,4 @@
-"""How a specimen is imaged: resolution, framing, grey levels."""
+"""Options of imaging a specimen: resolution, framing, grey levels."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from modeharvest.util.machine import require_memory
 
 _FEWEST_PX = 8
 _BYTES_PER_PIXEL = 250.0
-"""Of making images with their truth; 215 were measured from 1 to 3.6 Mpx."""
+"""Memory for making images with their truth [bytes/px]; measured: 215 for 1 to 3.6 Mpx."""
 
 
 @dataclass(frozen=True)
 class ImagingSpec:
-    """How a specimen is imaged; InputError if a value is out of its range."""
+    """How a specimen is imaged; InputError if a value is out of range."""
 
     pixel_size: float = 0.01
     """Edge of a pixel [mm/px]."""
     margin_px: int = 40
-    """Background kept around the specimen in all its states [px]; the image size follows."""
+    """Width of background around the specimen in all states [px]; determines the image size."""
     shape: tuple[int, int] | None = None
-    """(rows, cols) instead of the size that follows from the margin [px]."""
+    """(rows, cols) of the images [px], instead of the size that follows from the margin."""
     background: float = 0.0
     """Intensity where there is no material [fraction of full scale]."""
     bits: int = 8
-    """Bits of the camera-like copies, 1 to 16."""
+    """Bit depth of the camera images, 1 to 16."""
     speckle: SpeckleSpec = field(default_factory=SpeckleSpec)
-    """The pattern."""
+    """The speckle pattern."""
     sensor: Sensor = field(default_factory=Sensor)
-    """What a pixel averages, and its noise; the default shows points without noise."""
+    """Aperture and noise of the pixels; by default pixels sample points without noise."""
     distortion: CameraDistortion | str | None = None
-    """Of the lens: a camera's, or the name of a file; None is a perfect lens. Where there is one,
-    pixels show points, in the images and in their masks as the lens distorts them; the truth stays
-    on the ideal grid, that of the images once undistorted."""
+    """Distortion of the lens: a camera model, or the name of a file; None: perfect lens. With a
+    distortion, pixels must sample points. Images and masks are then distorted; the truth is on the
+    ideal grid, which is the grid of the undistorted images."""
     affine_distortion: bool = True
-    """False takes the distortion's affine part away
-    (``distortion.lens.without_affine``): it is no more than another pixel
+    """False removes the affine part of the distortion
+    (``distortion.lens.without_affine``): it is equivalent to another pixel
     size, unobservable in images of a target whose shifts are unknown."""
 
     def __post_init__(self) -> None:
@@ -72,9 +72,9 @@ class ImagingSpec:
 
 
 def choose_grid(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> PixelGrid:
-    """The grid, centred on the undeformed specimen, that holds it in all its states.
+    """The grid, centred on the undeformed specimen, that contains the specimen in all states.
 
-    InputError if the specimen doesn't fit an image size that the spec prescribes.
+    InputError if the specimen doesn't fit into the image size of ``spec.shape``.
     """
     nodes = solution.mesh.nodes
     centre = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))

@@ -1,13 +1,13 @@
 """Value and gradient of an image between its pixels, by B-splines of order 3, 5 or 11.
 
-The image is prefiltered once, so that the spline passes through every pixel: each line goes through
-a recursive filter, forwards and backwards, once for every pole; the mirrored border makes it exact.
-A sample costs 16, 36 or 144 coefficients. Speckle below 6 px: docs/explanation/metrology.md.
+The image is prefiltered once, so that the spline passes through every pixel: a recursive filter
+runs over each line, forwards and backwards, for every pole; the mirrored border makes it exact.
+A sample uses 16, 36 or 144 coefficients. Speckle below 6 px: docs/explanation/metrology.md.
 
-Compilers turn loops over many points into vectors, but here neighbouring points read from places
-that differ; what can go side by side are the taps of a row: the four of a cubic spline as a vector,
-the six of a quintic one as a vector of eight whose last two weights are zero, the twelve of one of
-order 11 as a vector of sixteen. LLVM splits them where the machine's vectors are shorter.
+Compilers vectorise loops over many points, but here neighbouring points read from different
+places. The taps of a row are vectorised instead: the four of a cubic spline as a vector, the six of
+a quintic spline as a vector of eight whose last two weights are zero, the twelve of a spline of
+order 11 as a vector of sixteen. LLVM splits them if the machine's vectors are shorter.
 
 Source: Unser, Aldroubi, Eden 1993, doi 10.1109/78.193220 (poles, initial values).
 """
@@ -32,7 +32,7 @@ from modeharvest.util.compiled import compiled, in_parallel
 from modeharvest.util.errors import InputError
 
 ORDERS = (3, 5, 11)
-"""Of splines."""
+"""Available spline orders."""
 
 
 @cache
@@ -45,7 +45,7 @@ def poles(order: int) -> FloatArray:
     polynomial = np.polynomial.Polynomial(samples)
     roots = polynomial.roots().real
     found: FloatArray = roots[abs(roots) < 1.0]
-    for _ in range(3):  # Newton, because the roots of an eigenvalue problem have lost digits
+    for _ in range(3):  # Newton steps: roots from an eigenvalue problem have lost digits
         found = found - polynomial(found) / polynomial.deriv()(found)
     return np.asarray(np.sort(found))
 
@@ -56,10 +56,10 @@ _NEGLIGIBLE = 1e-18
 
 
 def border_reach(order: int, share: float) -> int:
-    """How far from an image's border its continuation matters by more than a share [px].
+    """Distance from an image's border at which the effect of its mirroring falls to ``share`` [px].
 
-    It matters less with every pixel by the largest pole, 0.27, 0.43 or 0.66; ``share`` is of what
-    it matters at the border itself [-].
+    The effect decreases with every pixel by the factor of the largest pole, 0.27, 0.43 or 0.66;
+    ``share`` is relative to the effect at the border itself [-].
     """
     return int(np.ceil(np.log(share) / np.log(abs(poles(order)).max())))
 
@@ -67,9 +67,9 @@ def border_reach(order: int, share: float) -> int:
 def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[Any]:
     """Coefficients of the spline of order 3, 5 or 11 that passes through every pixel.
 
-    (rows + 2 pad, cols + 2 pad), of the image's type; the recursion itself runs in float64. The
-    image (rows, cols), of float32 or float64, at least 2 x 2, is mirrored about its outermost
-    pixels, and so are the coefficients: ``pad`` [px] rows and columns of them are put around it.
+    Shape (rows + 2 pad, cols + 2 pad), type of the image; the recursion runs in float64. The
+    image (rows, cols), float32 or float64, at least 2 x 2, is mirrored about its outermost
+    pixels; so are the coefficients, of which ``pad`` rows and columns are added on each side.
     """
     rows, cols = image.shape
     padded = np.pad(image, pad)
@@ -83,9 +83,9 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
 
 
 def _mirrored(poles: FloatArray, n: int) -> FloatArray:
-    """(poles, taps): weights of a line's first values in the first value of the filtered line.
+    """(poles, taps) weights of a line's first values in the first value of the filtered line.
 
-    The line is mirrored at both of its ends, so that it has a period of 2 n - 2.
+    The line of n values is mirrored at both ends, so that it has a period of 2 n - 2.
     """
     taps = min(n, int(np.log(_NEGLIGIBLE) / np.log(abs(poles).max())) + 1)
     k, z = np.arange(taps), poles[:, None]
@@ -97,7 +97,7 @@ def _mirrored(poles: FloatArray, n: int) -> FloatArray:
 
 @compiled(inner=True, relaxed=True)
 def _filter(lines: Any, n: int, poles: Any, first: Any, gain: float) -> None:
-    """Filter lines[:n, :] along its first axis, all of its columns side by side."""
+    """Filter lines[:n, :] along its first axis, all columns together."""
     width = lines.shape[1]
     start = np.empty(width)
     for p in range(poles.size):
@@ -106,7 +106,7 @@ def _filter(lines: Any, n: int, poles: Any, first: Any, gain: float) -> None:
         for k in range(first.shape[1]):
             for m in range(width):
                 start[m] += first[p, k] * lines[k, m]
-        # One by one: assigning arrays brings error messages that take a second to compile.
+        # One by one: array assignment includes error messages that take a second to compile.
         for m in range(width):
             lines[0, m] = start[m]
         for i in range(1, n):
@@ -142,7 +142,7 @@ def _filter_columns(
 
 
 def _pad_mirrored(padded: NDArray[Any], pad: int) -> None:
-    """Fill the frame of an array from what it frames, mirrored about the outermost values."""
+    """Fill the margin of an array with its interior, mirrored about the outermost values."""
     rows, cols = (size - 2 * pad for size in padded.shape)
     up, left = (np.pad(np.arange(pad, pad + n), pad, mode="reflect") for n in (rows, cols))
     interior = padded[pad : pad + rows]
@@ -159,14 +159,14 @@ _RELAXED = ("contract", "reassoc", "nsz", "arcp")
 
 
 def lane_weights(order: int) -> FloatArray:
-    """(order + 1, lanes): a tap's weight at the fraction t is a sum over t^power, power by lane.
+    """(order + 1, lanes) coefficients of t^power in the weight of a tap, [power, lane].
 
     There are 4, 8 or 16 lanes, of which the last may be zero. Lane 0 is the tap (order - 1)/2
-    pixels to the left of the one that t counts from.
+    pixels to the left of the pixel from which the fraction t is measured.
     """
     taps = order + 1
     found = np.zeros((taps, 1 << (taps - 1).bit_length()))
-    # Exact, of whole numbers; the last tap is at the spline's left end.
+    # Exact integer arithmetic; the last tap is at the spline's left end.
     for power, tap in np.ndindex(taps, taps):
         left, rest = order - tap, order - power
         terms = ((-1) ** k * comb(taps, k) * (left - k) ** rest for k in range(left + 1))
@@ -175,24 +175,24 @@ def lane_weights(order: int) -> FloatArray:
 
 
 class _Vectors:
-    """Arithmetic with vectors of so many lanes, put at the builder's place."""
+    """Emits LLVM arithmetic on vectors with a given number of lanes at the builder's position."""
 
     def __init__(self, builder: Any, lanes: int) -> None:
         self.builder, self.lanes = builder, lanes
         self.type = ir.VectorType(_DOUBLE, lanes)
 
     def times_plus(self, a: Any, b: Any, c: Any) -> Any:
-        """Give a b + c."""
+        """Return a b + c."""
         product = self.builder.fmul(a, b, flags=_RELAXED)
         return self.builder.fadd(product, c, flags=_RELAXED)
 
     def everywhere(self, vector: Any, lane: int) -> Any:
-        """Copy one lane to all."""
+        """Copy one lane to all lanes."""
         lanes = ir.Constant(ir.VectorType(_LANE, self.lanes), [lane] * self.lanes)
         return self.builder.shuffle_vector(vector, ir.Constant(self.type, ir.Undefined), lanes)
 
     def polynomials(self, coefficients: FloatArray, t: Any) -> Any:
-        """Evaluate one polynomial a lane, by Horner's rule, at a scalar t."""
+        """Evaluate one polynomial per lane at a scalar t, by Horner's rule."""
         nothing, first = ir.Constant(self.type, ir.Undefined), ir.Constant(_LANE, 0)
         t = self.everywhere(self.builder.insert_element(nothing, t, first), 0)
         *rest, total = (ir.Constant(self.type, row.tolist()) for row in coefficients)
@@ -201,7 +201,7 @@ class _Vectors:
         return total
 
     def dot(self, a: Any, b: Any) -> Any:
-        """Sum of the products."""
+        """Scalar product of two vectors."""
         signature = ir.FunctionType(_DOUBLE, [_DOUBLE, self.type])
         name = f"llvm.vector.reduce.fadd.v{self.lanes}f64"
         total = cgutils.get_or_insert_function(self.builder.module, signature, name)
@@ -210,7 +210,7 @@ class _Vectors:
 
 
 def _sampler(order: int) -> Any:
-    """Make the compiled sampler of a spline."""
+    """Make the compiled sampler of a spline of this order."""
     count, powers = order + 1, lane_weights(order)
     lanes = powers.shape[1]
     slopes = np.arange(1, count)[:, None] * powers[1:]
@@ -252,15 +252,15 @@ def _sampler(order: int) -> Any:
 
 
 _cubic, _quintic, _eleventh = (cast(Any, _sampler(order)) for order in ORDERS)
-"""(value, d_row, d_col) from c[i : i + taps, j : j + taps], as many taps as the order and one.
+"""(value, d_row, d_col) from c[i : i + taps, j : j + taps], with taps = order + 1.
 
-The fractions t_row and t_col count from the last tap of the first half. What is read to the right
-of the taps, two values or four, has no weight; c has to be contiguous, and to have a row below
-them: what is read to the right of the last column is that row's beginning.
+The fractions t_row and t_col are measured from the last tap of the first half. The two or four
+values read to the right of the taps have zero weight. c must be contiguous and have one more row
+below: to the right of the last column, the beginning of the next row is read.
 """
 
 PAD = 6
-"""Rows and columns of mirrored coefficients around the image, so that no tap needs a test."""
+"""Rows and columns of mirrored coefficients around the image, so that taps need no bounds test."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,8 +281,8 @@ class SplineImage:
     def of(cls, image: ArrayLike, order: int = 5, dtype: Any = np.float32) -> SplineImage:
         """Prefilter an image (rows, cols), mirrored at its border, and keep the coefficients.
 
-        ``dtype`` is how these are stored: float32 costs 1e-7 of full scale. InputError if the image
-        isn't of 2 x 2 px or more, or the order is not 3, 5 or 11.
+        ``dtype``: type of the coefficients; float32 has an error of 1e-7 of full scale. InputError
+        if the image isn't at least 2 x 2 px, or the order is not 3, 5 or 11.
         """
         pixels = np.asarray(image, dtype=np.dtype(dtype))
         if pixels.ndim != 2 or min(pixels.shape) < 2:
@@ -295,9 +295,9 @@ class SplineImage:
         return self.coefficients.shape[0] - 2 * PAD, self.coefficients.shape[1] - 2 * PAD
 
     def sample(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(value, d_row, d_col) [grey levels, and per px] at positions (row, col) [px].
+        """(value, d_row, d_col) [grey levels, grey levels/px] at positions (row, col) [px].
 
-        They may be of any common shape; NaN outside the image. d_row is along *increasing row*.
+        Positions broadcast together; NaN outside the image. d_row is along *increasing row*.
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         value, d_row, d_col = (np.empty(row.size) for _ in range(3))

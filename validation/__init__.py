@@ -1,1 +1,1 @@
-"""Validation: how far measurements are from the truth, and why."""
+"""Validation: errors of measurements against the truth, and their causes."""

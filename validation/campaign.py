@@ -1,10 +1,10 @@
 """Campaigns: one function for a grid of cases, run by workers, each case stored when it is done.
 
-A case is a mapping of plain values, its seed among them. Its outcome is written, whole or not at
-all, by the worker that ran it, to ``cases/KEY.json`` with KEY the digest of the function's name,
-the case and modeharvest's code: a campaign that is killed goes on where it was, an option that is
-changed makes anew what it touches and nothing else, and results of other code are never mixed with
-this one's. A case that fails is stored with its traceback, and the rest goes on.
+A case is a mapping of plain values, including its seed. The worker that ran it writes its result
+atomically to ``cases/KEY.json``, where KEY is the digest of the function's name, the case and
+modeharvest's code. So a killed campaign continues where it stopped, a changed option repeats only
+the cases that depend on it, and results of different code are never mixed. A case that fails is
+stored with its traceback, and the other cases continue.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from modeharvest.validation import workers as work
 from modeharvest.validation.workers import Case, Cases, Workers
 
 _Outcome = Literal["stored", "killed", "cut off"]
-"""Of a case handed to dask: result or failure stored, worker died twice, connection broke."""
+"""Outcome of a case in dask: result or failure stored, worker died twice, connection broke."""
 _KILLED = "KilledWorker: its workers died; it may need more memory than they are given"
 _ATTEMPTS = 3
-"""Connections in a row that may break before a case is done."""
+"""Number of consecutive connections that may break before any case is done."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Campaign:
     function: str
     """A :data:`~modeharvest.validation.workers.CaseFunction`, as "package.module:name"."""
     cases: Cases
-    """What to run it with, all with the same keys. What it reads from ``folder`` belongs in them by
-    a digest, so that a result is known to be of other inputs."""
+    """Arguments of the function, all with the same keys. For input that it reads from ``folder``, a
+    digest belongs in the case, so that results of other inputs are recognised."""
     folder: Path
 
     def __post_init__(self) -> None:
@@ -57,7 +57,7 @@ class Campaign:
         work.named(self.function)
 
     def path(self, case: Case) -> Path:
-        """Where the result of a case is stored."""
+        """The file in which the result of a case is stored."""
         return work.result_path(self.function, case, self.folder)
 
     def missing(self) -> Cases:
@@ -66,10 +66,10 @@ class Campaign:
         return tuple(case for case, is_done in zip(self.cases, done, strict=True) if not is_done)
 
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
-        """Run what is missing and return the table; also left as ``table.csv``, without lists.
+        """Run the missing cases and return the table; ``table.csv`` has it without lists.
 
-        By default by two processes of this machine. InputError if the folder can't be written to or
-        is in use, the scheduler is not there or goes away, or its workers can't do the work.
+        The default workers are two local processes. InputError if the folder can't be written to or
+        is in use, the scheduler can't be reached or stops, or its workers can't run the function.
         """
         require_writable(self.folder)
         with exclusive(self.folder):
@@ -86,7 +86,7 @@ class Campaign:
         return table
 
     def table(self) -> pd.DataFrame:
-        """A row for each case: its values, ``error`` (empty if none), its result."""
+        """A row for each case: its values, ``error`` (empty if it succeeded), its result."""
         rows = []
         for case in self.cases:
             record = work.read_result(self.path(case)) or {"error": "not run"}
@@ -95,16 +95,16 @@ class Campaign:
         return pd.DataFrame(rows)
 
     def of_other_versions(self) -> dict[str, int]:
-        """How many stored results are of another version or no longer asked for, by version."""
+        """Number of stored results of other versions or of cases no longer in use, by version."""
         wanted = {self.path(case) for case in self.cases}
         others = set((self.folder / "cases").glob("*.json")) - wanted
         return Counter(str(work.stored(path).get("version", "unknown")) for path in sorted(others))
 
     def _settled(self, cases: Sequence[Case], workers: Workers) -> Iterator[Case]:
-        """The cases as they get done, or fail for certain.
+        """Yield each case when it is done or has finally failed.
 
-        A connection that breaks is made anew. Only where that fails is the scheduler gone, whatever
-        dask reports of a case (docs/decisions/0011-campaigns-on-busy-machines.md).
+        A broken connection is renewed. The scheduler counts as lost only if that fails, whatever
+        dask reports about a case (docs/decisions/0011-campaigns-on-busy-machines.md).
         """
         left, in_vain = list(cases), 0
         while left:
@@ -113,7 +113,7 @@ class Campaign:
                 try:
                     client = stack.enter_context(workers.client(self.function, self.folder))
                 except InputError as error:
-                    if len(left) == len(cases):  # it never was there, or cannot do the work
+                    if len(left) == len(cases):  # scheduler never reached, or unable to work
                         raise
                     raise InputError(self._gone(error)) from error
                 for case, outcome in self._tried(client, left):
@@ -127,7 +127,7 @@ class Campaign:
             left = cut_off
 
     def _gone(self, how: object) -> str:
-        """The message where a scheduler doesn't come back."""
+        """The message for a scheduler that doesn't come back."""
         done = len(self.cases) - len(self.missing())
         return (
             f"expected the dask scheduler to stay until all cases are done, but it went away; "
@@ -136,10 +136,10 @@ class Campaign:
         )
 
     def _tried(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
-        """Each case with what became of it in the end.
+        """Yield each case with its final outcome.
 
-        A worker may have died of what it ran beside a case: those whose worker died are tried
-        again, each alone, and only then stored as failed.
+        A worker may have died because of another case that ran at the same time. Cases whose worker
+        died are therefore repeated, each alone, and only then stored as failed.
         """
         killed = []
         for case, outcome in self._submitted(client, cases):
@@ -154,19 +154,19 @@ class Campaign:
                 yield case, outcome
 
     def _submitted(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
-        """Run cases side by side; each with its outcome, as they come."""
+        """Run cases in parallel; yield each with its outcome when it is done."""
         from distributed import KilledWorker, as_completed
 
-        folder = str(self.folder.resolve())  # workers elsewhere have another current one
+        folder = str(self.folder.resolve())  # remote workers have another current folder
         submit = partial(client.submit, work.run_case, self.function, pure=False)
         futures = {submit(case, folder, source_digest()): case for case in cases}
         completed = as_completed(list(futures))  # type: ignore[no-untyped-call]
         for future in completed:
             if future.status not in ("finished", "error", "cancelled"):
-                # The worker that held its result has died: dask asks another for it.
+                # The worker that held the result has died: dask runs the case on another one.
                 completed.add(future)  # type: ignore[no-untyped-call]
                 continue
-            case = futures.pop(future)  # and dask may forget its result
+            case = futures.pop(future)  # so that dask can release its result
             if future.status == "cancelled":
                 yield case, "cut off"
             elif future.status == "finished":
@@ -179,10 +179,10 @@ class Campaign:
 
 
 def grid(base: Case, **axes: Sequence[Any]) -> Cases:
-    """All combinations of some values, each on top of a base case.
+    """All combinations of some values, each replacing those of a base case.
 
-    ``axes``: the values that keys of the base run through, the last fastest; InputError if one is
-    not a key of the base, or has no value or one twice.
+    ``axes``: the values of keys of the base, the last key varying fastest. InputError if a name is
+    not a key of the base, or has no values or the same value twice.
     """
     for name, values in axes.items():
         if name not in base:

@@ -1,16 +1,16 @@
-"""Design of a test: the errors that its noise will make, before anything is cut or photographed.
+"""Design of a test: prediction of its errors by noise, before a specimen is made or photographed.
 
-With S the derivatives of the displacement by the unknowns, those of the residual are h = ∇f F⁻¹ S,
-and the Cramér–Rao bound of the unknowns is the inverse of
+With S = du/da, a the unknowns, the derivative of the residual is h = ∇f F⁻¹ S, and the
+Cramér–Rao bound of the unknowns' covariance is the inverse of
 
     M = Σ h' h / (s² (1 + 1/det F)) = G / (2 p⁴ s²) ∫ S' (F F')⁻¹ S / (1 + 1/det F) dA,
 
-for noise s of either image. In place of an image's gradient stands its mean square G [1/px²],
-alike in all directions, and in place of the pixels, of size p, the material without its edges. No
-image is made: M is an integral over the specimen times a number, and only the pixels that are left
-out along edges make the integral depend on p.
+for noise s in each image. The image gradient is replaced by its mean square G [1/px²], assumed
+isotropic, and the sum over pixels of size p by an integral over the material without its edges. No
+image is made: M is an integral over the specimen times a factor. The integral depends on p only
+through the pixels excluded along edges.
 
-What the ansatz can't describe, w, is no noise, and no part of these errors.
+The model error w, which the ansatz can't describe, is not noise and not part of these errors.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ from modeharvest.validation.design_parameters import ModelStates
 from modeharvest.validation.truth import rms
 
 _POINTS = 16_384
-"""At which the integrand is taken, evenly over the specimen's rectangle."""
+"""Number of integration points, distributed evenly over the specimen's rectangle."""
 _PER_CELL = 24
-"""Places a pitch at which a simulated displacement is fitted by the ansatz."""
+"""Points per pitch at which the ansatz is fitted to a simulated displacement."""
 _HARMONICS = 20
 Mapped = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""F (k, 2, 2) of a state and derivatives of u (k, 2, n), at points (k, 2) [mm]."""
+"""From points (k, 2) [mm] to F (k, 2, 2) of a state and derivatives of u (k, 2, n)."""
 LARGEST = 0.04
-"""Of ||phi|| [-], as modes are scaled."""
+"""Largest ||phi|| [-], by the normalisation of modes."""
 
 
 @dataclass(frozen=True)
 class DesignRanges:
-    """Table ``[design.ranges]``: what each is varied over, all else as in the case; rising."""
+    """Table ``[design.ranges]``: ascending values of each quantity, the others as in the case."""
 
     pixel_size: tuple[float, ...] = quantity(
         "pixel size", "mm", default=(0.005, 0.01, 0.02, 0.03, 0.04, 0.06)
@@ -83,35 +83,35 @@ class DesignRanges:
 
 AXES = tuple(f.name for f in fields(DesignRanges))
 NEEDED = AXES[:5]
-"""Of these the value is sought that a wanted error needs."""
+"""Quantities whose value for a wanted error is computed."""
 WANTED = ("v1_percent", "wave_number", "phase")
 
 
 @dataclass(frozen=True)
 class DesignOptions:
-    """Table ``[design]`` of a case; InputError if a value is out of its range."""
+    """Table ``[design]`` of a case; InputError if a value is out of range."""
 
     v1_percent: float = 0.02
     wave_number: float = 3e-5
     phase: float = 1e-4
     parameter_percent: float = 1.0
-    """Wanted, of the :class:`ExpectedErrors`."""
+    """Wanted values of the :class:`ExpectedErrors` of the same names."""
     parameters: tuple[str, ...] = ()
-    """To be identified from all states' images and forces, as in ``[unknowns]`` of an
-    identification; none by default."""
+    """Parameters to be identified from images and forces of all states, named as in ``[unknowns]``
+    of an identification; none by default."""
     force_sd: float = 0.0
-    """Of the load cell; 0 for a test without [N/mm]."""
+    """Standard deviation of the load cell [N/mm]; 0: no load cell."""
     strain: float | None = None
-    """Of the state [-]; by default the case's last."""
+    """Nominal strain of the state [-]; by default the last one of the case."""
     pattern: float | None = None
-    """Largest displacement of an even pattern [mm], instead of that of a simulated solution."""
+    """Largest displacement of a uniform pattern [mm], instead of a simulated solution's pattern."""
     noise: float = 0.01
-    """Read noise of an exposure [fraction of full scale], where the case's sensor has no noise."""
+    """Read noise of an exposure [fraction of full scale], if the case's sensor has no noise."""
     exposures: int = 1
-    """Averaged, of the reference and of each state."""
+    """Number of exposures averaged, for the reference and for each state."""
     map: tuple[str, str] = ("pixel_size", "noise")
     contour: str = "v1_percent"
-    """What is varied along the map's axes, over its ranges, and the error that it shows."""
+    """Quantities varied over their ranges along the map's two axes, and the error it shows."""
     ranges: DesignRanges = field(default_factory=DesignRanges)
 
     def __post_init__(self) -> None:
@@ -126,13 +126,13 @@ class DesignOptions:
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """Names of the errors that are looked at."""
+        """Names of the errors to compare with wanted values."""
         return (*WANTED, "parameter_percent") if self.parameters else WANTED
 
 
 @dataclass(frozen=True)
 class DesignSetup:
-    """How a test is photographed and measured; the names are those of the ranges."""
+    """How a test is photographed and measured; fields as in :class:`DesignRanges`."""
 
     pixel_size: float
     noise: float
@@ -146,7 +146,7 @@ class DesignSetup:
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Standard deviations by noise, at the Cramér–Rao bound."""
+    """Standard deviations due to noise, at the Cramér–Rao bound."""
 
     u_px: float = quantity("u, rms", "px")
     v1_px: float = quantity("v₁ max‖φ₁‖, rms", "px")
@@ -155,21 +155,21 @@ class ExpectedErrors:
     phase: float = quantity("phases, largest", "mm")
     image_noise: float = quantity("noise of an image", "% of full scale")
     parameter_percent: float | None = quantity("parameters, largest", "% of the value")
-    """Of those whose value isn't 0; None if none are sought."""
+    """Of parameters whose value isn't 0; None without parameters to identify."""
     w_px: float | None = quantity("model error, rms", "px")
-    """What the ansatz leaves of the simulated displacement: no part of the others. None if that
-    was not simulated: a pattern that was given, another strain."""
+    """Residual of the ansatz fitted to the simulated displacement; not part of the other errors.
+    None without a simulation of the state: a given pattern, another strain."""
     parameter_sd: tuple[float, ...] = ()
-    """Of each that is sought, in its own unit."""
+    """Standard deviation of each parameter, in its unit."""
 
 
 @dataclass(frozen=True, eq=False)
 class PatternState:
-    """A state of the specimen as an ansatz has it, and what an integral over it needs."""
+    """A state of the specimen, described by an ansatz."""
 
     ansatz: Ansatz
     unknowns: FloatArray
-    """(n,)."""
+    """(n,) unknowns of the ansatz."""
     w: float | None = None
     """Model error, rms per component [mm]; None if not known."""
 
@@ -177,7 +177,7 @@ class PatternState:
     def fitted(
         cls, ansatz: Ansatz, pitch: float, solution: Solution, strain: float, amplitude: float
     ) -> PatternState:
-        """Fit an ansatz to a solution's snapshot, beginning with an ``amplitude`` of v_i [mm]."""
+        """Fit an ansatz to a solution's snapshot, from an initial ``amplitude`` of v_i [mm]."""
         mesh, u = solution.mesh, solution.at(strain).displacement
         low, high, step = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0), pitch / _PER_CELL
         cols, rows = (int(n) for n in (high - low) / step)
@@ -204,20 +204,20 @@ def _weighted(F: FloatArray, S: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What a test's design needs; InputError without a solution or a pattern."""
+    """Computes the expected errors of a test; InputError without a solution or a pattern."""
 
     specimen: Specimen
     imaging: ImagingSpec
     correlation: SquareLatticeOptions
     options: DesignOptions
     strain: float
-    """Nominal, of the state designed for [-]."""
+    """Nominal strain of the state designed for [-]."""
     solution: Solution | None = None
-    """Its displacement; not looked at where the options give a pattern."""
+    """Simulated displacement of the state; ignored if the options give a pattern."""
     model: ModelStates | None = None
-    """States of the model whose parameters are sought; needed if any are."""
+    """States of the model whose parameters are to be identified; None if there are none."""
     _known: dict[Any, Any] = field(default_factory=dict)
-    """States, their integrands, signals with their errors, speckles, by what they depend on."""
+    """Cache of states, integrands, signals with errors, and speckles, by what they depend on."""
 
     def __post_init__(self) -> None:
         if self.options.pattern is None and self.solution is None:
@@ -227,7 +227,7 @@ class Design:
 
     @property
     def setup(self) -> DesignSetup:
-        """The case's own."""
+        """The setup of the case."""
         sensor, how = self.imaging.sensor, self.correlation
         is_noisy = sensor.read_noise > 0.0 or sensor.full_well > 0.0
         noise = sensor.read_noise if is_noisy else self.options.noise
@@ -236,18 +236,18 @@ class Design:
 
     @cached_property
     def critical(self) -> float:
-        """Nominal strain of buckling [-]; infinite where it is not known."""
+        """Nominal critical strain of buckling [-]; infinite if unknown."""
         info = self.solution.info if self.solution and self.options.pattern is None else {}
         return float((info.get("critical") or {"strain": np.inf})["strain"])
 
     @cached_property
     def points(self) -> FloatArray:
-        """(k, 2) evenly over the specimen's rectangle [mm], holes included."""
+        """(k, 2) points spread evenly over the specimen's rectangle, including holes [mm]."""
         half = np.array(self.specimen.half_size)
         return np.asarray((2.0 * qmc.Halton(2, scramble=False).random(_POINTS) - 1.0) * half)
 
     def used(self, margin: float) -> BoolArray:
-        """(k,) True where all of a square is material, half its side ``margin`` [mm]."""
+        """(k,) True where a square of half side ``margin`` [mm] about the point is all material."""
         specimen, points = self.specimen, self.points
         number = specimen.nearest_hole(points)
         off = np.maximum(abs(points - specimen.hole_centres[number]) - margin, 0.0)
@@ -257,10 +257,10 @@ class Design:
         return np.asarray(is_inside & ~is_in_hole)
 
     def state(self, setup: DesignSetup) -> PatternState:
-        """The state that is measured, as the setup's ansatz has it.
+        """The measured state, described by the setup's ansatz.
 
-        At another strain than the design's v0 grows in proportion, and the pattern by the root law
-        of a pitchfork from the critical strain on. InputError unless both are beyond that.
+        For another strain than the design's, v0 is scaled in proportion to the strain and the
+        pattern by a pitchfork's square-root law. InputError unless both exceed the critical strain.
         """
         degrees, own, least = (setup.v0_degree, setup.v_degree), self.strain, self.critical
         if degrees not in self._known:
@@ -285,7 +285,7 @@ class Design:
         return replace(found, unknowns=a, w=None)
 
     def signal(self, setup: DesignSetup) -> float:
-        """G/(2 p⁴ s²) [1/mm⁴], which the integral is multiplied by."""
+        """G/(2 p⁴ s²), the factor of the integral in M [1/mm⁴]."""
         _, found = self.speckle(setup)
         contrast = self.imaging.sensor.gain * setup.light
         noise = self.image_noise(setup) * setup.pixel_size**2
@@ -294,7 +294,7 @@ class Design:
     def image_noise(self, setup: DesignSetup) -> float:
         """Standard deviation of an image's noise by the sensor's model [fraction of full scale].
 
-        InputError if the light saturates it.
+        InputError if the light saturates the sensor.
         """
         spec, speckle = self.speckle(setup)
         sensor = replace(self.imaging.sensor, read_noise=setup.noise)
@@ -306,7 +306,7 @@ class Design:
         return averaged_noise(sensor, self.imaging.bits, grey, setup.exposures)
 
     def expected(self, setup: DesignSetup) -> ExpectedErrors:
-        """The errors to expect of a setup, over the material and the lattice."""
+        """The expected errors of a setup: of u over the material, of v1 over the lattice."""
         key = "errors", setup.v0_degree, setup.v_degree, setup.strain, setup.pixel_size
         if key not in self._known:
             self._known[key] = self.signal(setup), self._errors(setup)
@@ -324,8 +324,8 @@ class Design:
     def parameter_sd(self, setup: DesignSetup) -> FloatArray:
         """(k,) standard deviations of the model's parameters.
 
-        By the images and forces of all states; that of the setup's strain is the last. InputError
-        if the model has no state of that strain, or if nothing shows one of the parameters.
+        From images and forces of all states up to the setup's strain. InputError if the model has
+        no state at that strain, or if a parameter is not observable.
         """
         model, last = self.model, setup.strain
         if model is None or last not in model.states:
@@ -345,7 +345,7 @@ class Design:
         return np.asarray(sd)
 
     def _information(self, key: Any, mapped: Mapped, setup: DesignSetup) -> FloatArray:
-        """(n, n) ∫ S' (F F')⁻¹ S / (1 + 1/det F) dA over the pixels that are used [mm²]."""
+        """(n, n) ∫ S' (F F')⁻¹ S / (1 + 1/det F) dA over the material used [mm²]."""
         if key not in self._known:
             inside, points = self.used(0.0), self.points
             found = _weighted(*mapped(points[inside]))
@@ -356,9 +356,9 @@ class Design:
         return np.asarray(H.T @ H * 4.0 * float(np.prod(self.specimen.half_size)) / _POINTS)
 
     def varied(self, axis: str) -> list[tuple[float, ExpectedErrors]]:
-        """The errors with one of :data:`AXES` varied over its range, all else as in the case.
+        """(value, errors) for one of :data:`AXES` varied over its range, all else as in the case.
 
-        What can't be is left out: too much light, too narrow speckles, strains before buckling.
+        Impossible values are left out: too much light, too fine speckle, strains before buckling.
         """
         if axis not in self._known:
             self._known[axis] = []
@@ -369,10 +369,10 @@ class Design:
         return list(self._known[axis])
 
     def needed(self, axis: str, name: str) -> float | None:
-        """The value of one of :data:`NEEDED` with which the error ``name`` is as wanted.
+        """The value of one of :data:`NEEDED` at which the error ``name`` is the wanted one.
 
-        All else as in the case. The easiest end of the range if all of it will do; None if nothing
-        does.
+        All else as in the case. If the whole range is good enough, its least demanding end; None if
+        no value is.
         """
         wanted, values = getattr(self.options, name), [value for value, _ in self.varied(axis)]
 
@@ -388,7 +388,7 @@ class Design:
         return float(np.exp(brentq(excess, *np.log([values[0], values[-1]]), xtol=1e-4)))
 
     def mapped(self, points: int = 33) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Values along the map's axes, (points,) each, and the errors, the second down rows."""
+        """Values along the map's two axes, (points,) each; errors [second axis, first axis]."""
         (x, y), name = self.options.map, self.options.contour
         ranges = [[value for value, _ in self.varied(axis)] for axis in (x, y)]
         if min(map(len, ranges)) < 2:
@@ -402,7 +402,7 @@ class Design:
         return replace(self.setup, **changed)
 
     def covariance(self, setup: DesignSetup) -> FloatArray:
-        """(n, n) bound of the unknowns' covariance; InputError if one of them doesn't show."""
+        """(n, n) bound of the unknowns' covariance; InputError if one isn't observable."""
         state = self.state(setup)
         key = "integrand", setup.v0_degree, setup.v_degree, setup.strain
         M = self.signal(setup) * self._information(key, state.mapped, setup)
@@ -417,7 +417,7 @@ class Design:
         return np.asarray(np.linalg.inv(M / sizes) / sizes)
 
     def _errors(self, setup: DesignSetup) -> ExpectedErrors:
-        """From the covariance, all but the image's noise."""
+        """The errors that follow from the covariance: all except the image noise."""
         state, covariance, p = self.state(setup), self.covariance(setup), setup.pixel_size
         ansatz, a, at = state.ansatz, state.unknowns, self.points[self.used(0.0)][::8]
         is_cellular = (abs(at) <= self.specimen.cellular_half_size).all(axis=1)
@@ -441,7 +441,7 @@ class Design:
         )
 
     def speckle(self, setup: DesignSetup) -> tuple[SpeckleSpec, SpeckleStatistics]:
-        """The case's speckle, its layers that much wider, and its statistics."""
+        """The case's speckle, coarser by the factor ``speckle_width``, and its statistics."""
         times = setup.speckle_width
         if ("speckle", times) not in self._known:
             spec, ink = self.imaging.speckle, self.imaging.speckle.ink
@@ -451,7 +451,7 @@ class Design:
             spread, blur = spec.standard_deviation / times, spec.blur_px * times
             spec = replace(spec, standard_deviation=spread, blur_px=blur, ink=ink)
             aperture = self.imaging.sensor.aperture
-            spread = aperture.psf_px**2 + aperture.side_px**2 / 12.0  # as if it were a Gaussian
+            spread = aperture.psf_px**2 + aperture.side_px**2 / 12.0  # Gaussian of equal variance
             found = SpeckleStatistics.of(spec, spread)
             self._known["speckle", times] = spec, found
         spec, found = self._known["speckle", times]
@@ -459,10 +459,10 @@ class Design:
 
 
 def averaged_noise(sensor: Sensor, bits: int, grey: float, exposures: float) -> float:
-    """Standard deviation of the mean of exposures, at a grey level above the offset [fraction].
+    """Noise of the mean of several exposures [fraction of full scale]; ``grey``: above the offset.
 
-    Rounding is averaged away only by noise that exceeds it: its errors in two exposures whose noise
-    is of s levels have the correlation 6/pi² Σ exp(-4 pi² k² s²)/k².
+    Averaging reduces rounding errors only if the noise exceeds them: in two exposures with noise of
+    s levels, rounding errors have the correlation 6/pi² Σ exp(-4 pi² k² s²)/k².
 
     Source: B. Widrow, I. Kollár, Quantization Noise (Cambridge 2008), doi
     10.1017/CBO9780511754661.

@@ -1,13 +1,13 @@
 """The critical load from the growth of an imperfect pattern, before it buckles.
 
-An imperfect specimen's pattern grows from the beginning, a = a0 p / (p_c - p) + c p + d p^2 with
-the load p: the first term is the critical mode's, with an imperfection a0 (R. V. Southwell, Proc.
-R. Soc. A 135 (1932), doi 10.1098/rspa.1932.0055), the others those of all other modes, which are
-far from theirs, and of the model error. Of each p_c the posterior probability is computed, a0, c, d
-and the error that all images have in common integrated out.
+The pattern of an imperfect specimen grows from the start, a = a0 p / (p_c - p) + c p + d p^2 with
+the load p. The first term is that of the critical mode, with an imperfection a0 (R. V. Southwell,
+Proc. R. Soc. A 135 (1932), doi 10.1098/rspa.1932.0055); the others are due to all other modes, far
+from their critical loads, and to the model error. The posterior probability of p_c is computed with
+a0, c, d and the error common to all images integrated out.
 
-Modes differ by their envelopes. The critical one's is a half wave across the lattice both ways, and
-:func:`half_wave` picks its amplitude out of v; the others' are nearly orthogonal to it.
+Modes differ by their envelopes. That of the critical mode is a half wave across the lattice in both
+directions; :func:`half_wave` extracts its amplitude from v. The others are nearly orthogonal to it.
 """
 
 from __future__ import annotations
@@ -22,57 +22,57 @@ from modeharvest.idic.result import Result
 from modeharvest.util.arrays import FloatArray
 
 FEWEST = 5
-"""Images that a prediction needs."""
+"""Least number of images for a prediction."""
 NEAR = 0.9
-"""Of the critical load: beyond, the amplitude is no longer small."""
+"""Fraction of the critical load beyond which the amplitude is no longer small."""
 OF_METHOD = 0.01
-"""Standard deviation of a prediction without noise, of the critical load: see
+"""Standard deviation of a prediction without noise, relative to the critical load: see
 docs/how-to/sequences.md."""
 _QUANTILES = (0.025, 0.5, 0.975)
 _COMMON = 0.5
-"""Share of the amplitudes' variance by noise of the reference, which all images have in common."""
+"""Share of the amplitudes' noise variance from the reference image, common to all images."""
 _OTHERS = 0.15
-"""c p is expected to be so much of a0 p / p_c and, as d p^2 is, of the standard deviation by model
-error at the last image, give or take: see docs/how-to/sequences.md."""
+"""Prior scale of c p relative to a0 p / p_c; the standard deviation by model error at the last
+image is added to it, and is the prior scale of d p^2: see docs/how-to/sequences.md."""
 _FAR, _NEGLIGIBLE = 10.0, 0.02
-"""Times the largest load: growth that points further, by a density over its largest, isn't seen."""
+"""Largest p_c tried, in largest loads; relative density there above which p_c has no upper end."""
 _TRIED, _ROUNDS = 2000, 4
 _POINTS = 41
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """The critical load, extrapolated from images at lower ones."""
+    """The critical load, extrapolated from images at lower loads."""
 
     critical: float
     low: float
     high: float
-    """The median's interval of 95 %; infinite where growth isn't told from a straight line."""
+    """Median and 95 % interval; ``high`` is infinite if the growth may be linear in the load."""
     imperfection: float
     """a0, in the unit of the amplitudes."""
     others: tuple[float, float, float]
-    """d, c and 0: the polynomial d p^2 + c p, the highest power first."""
+    """(d, c, 0): coefficients of the polynomial d p^2 + c p, highest power first."""
     largest: float
-    """Of the loads that it is made from."""
+    """Largest load of the images used."""
     count: int
-    """Of the images."""
+    """Number of images used."""
 
     @property
     def interval(self) -> str:
-        """In words, of strains."""
+        """The interval as text, for loads that are strains [%]."""
         high = "no upper end" if not np.isfinite(self.high) else f"{100 * self.high:.2f} %"
         return f"{100 * self.low:.2f} … {high}"
 
     @property
     def is_useful(self) -> bool:
-        """Whether the interval ends, and isn't wider than the critical load itself."""
+        """Whether the interval is finite and narrower than the critical load itself."""
         return self.high - self.low < self.critical
 
 
 def half_wave(result: Result, cellular: Box, noise: float) -> tuple[float, float, float]:
-    """Amplitude of a half wave in v1, both ways across a part of the specimen [mm].
+    """Amplitude of a half wave in v1 across ``cellular`` in both directions [mm].
 
-    And its standard deviations by noise [grey levels], and by all of the residual, model error too.
+    Also its standard deviations [mm] by ``noise`` [grey levels] and by the whole residual.
     """
     ansatz, ends = result.ansatz, np.linspace(-1.0, 1.0, _POINTS)
     x, y = (c + h * ends for c, h in zip(cellular.centre, cellular.half, strict=True))
@@ -88,9 +88,9 @@ def half_wave(result: Result, cellular: Box, noise: float) -> tuple[float, float
 def predict(columns: FloatArray) -> Prediction | None:
     """Extrapolate the growth of a pattern's amplitude to the critical load.
 
-    ``columns`` (4, n): load, amplitude and its standard deviations by noise, which counts as what
-    the amplitudes scatter if that is more, and by model error, which grows with the load; the last
-    of one sign and below the critical load. None from fewer than five, or if nothing grows.
+    ``columns`` (4, n): load, amplitude, its standard deviation by noise (increased to the observed
+    scatter if that is larger) and by model error, which grows with the load. Loads must be below
+    the critical one. None with fewer than five images, or if the amplitude doesn't grow.
     """
     load, amplitude, sd, model = columns[:, columns[0] > 0.0]
     if len(load) < FEWEST or not (sd > 0.0).all():
@@ -103,7 +103,7 @@ def predict(columns: FloatArray) -> Prediction | None:
     normal, right = columns @ columns.swapaxes(1, 2), columns @ a
     scatter, zero = 1.0, np.zeros(_TRIED)
     linear = zero + np.hypot(model[last], amplitude[last])
-    for _ in range(_ROUNDS):  # of each critical load a0, c, d, and what errors have in common
+    for _ in range(_ROUNDS):  # for each critical load: a0, c, d, and the common error
         prior = [zero, scatter / linear**2, zero + scatter / model[last] ** 2, zero + 1.0 / _COMMON]
         A = normal + np.stack(prior, axis=1)[:, None] * np.eye(4)
         found = np.linalg.solve(A, right[..., None])[..., 0]
@@ -128,10 +128,10 @@ def predict(columns: FloatArray) -> Prediction | None:
 def follow_growth(
     columns: FloatArray, known: Sequence[Prediction | None] = ()
 ) -> list[Prediction | None]:
-    """The prediction after each image of a test, in their order; of the first ones it is known.
+    """The prediction after each image of a test, in order; ``known``: those of the first images.
 
-    ``columns`` (4, n): as for :func:`predict`. A prediction stays as it is once the load is beyond
-    nine tenths of it, as buckling no longer lies ahead, and on the way back.
+    ``columns`` (4, n): as for :func:`predict`. A prediction is kept once the load exceeds nine
+    tenths of it, because buckling is then no longer ahead, and during unloading.
     """
     found = list(known)
     for n in range(len(found) + 1, columns.shape[1] + 1):

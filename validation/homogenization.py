@@ -1,9 +1,9 @@
-"""Measured modes in homogenization: snapped to the lattice, and what their error bars do.
+"""Measured modes in homogenization: snapping to the lattice, propagation of error bars.
 
-A mode from images is the lattice's own but for errors: its wave vectors and phases are snapped to
-the lattice, because 1 % of a wave number makes ten of the critical strain. What is left of its
-errors, those of its amplitudes, is propagated to critical strain, forces and energies by
-differences.
+A mode measured in images is a mode of the lattice except for errors. Its wave vectors and phases
+are snapped to the lattice, because an error of 1 % of a wave number changes the critical strain by
+10 %. The remaining errors, those of the amplitudes, are propagated to critical strain, forces and
+energies by finite differences.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _LEAST_STEP = 1e-3
-"""Of a parameter [-], [mm]: smaller differences would be rounding."""
+"""Least difference step of a parameter [-, mm]: smaller steps would give rounding errors."""
 _LEAST_OVERLAP = 0.9
-"""Of a mode with itself, its phases snapped [-]."""
+"""Least overlap of a mode with itself after snapping its phases [-]."""
 _SAME = 1e-9
-"""Of the largest wave number: patterns closer than that are one."""
+"""Relative difference below which two patterns are the same."""
 
 
 @dataclass(frozen=True)
@@ -35,47 +35,47 @@ class StateNumbers:
     """A state of a specimen, homogenized or simulated directly."""
 
     nominal_strain: float
-    """[-]."""
+    """Nominal strain [-]."""
     force_N_per_mm: float
-    """On the loaded edge, by thickness; compressive."""
+    """Compressive force on the loaded edge per thickness."""
     energy_N: float
-    """Stored, by thickness."""
+    """Stored energy per thickness."""
     branch: str = "primary"
     negative_eigenvalues: int | None = None
-    """Of the tangent, of both scales where there are two; 0: stable, None: unknown."""
+    """Negative eigenvalues of the tangent (of both scales if two); 0: stable, None: unknown."""
     force_sd_N_per_mm: float | None = None
     energy_sd_N: float | None = None
-    """Standard deviations by the mode's larger covariance that is known; None where it has none."""
+    """Standard deviations by the larger known covariance of the modes; None without covariance."""
     force_sd_noise_N_per_mm: float | None = None
     energy_sd_noise_N: float | None = None
     force_sd_model_error_N_per_mm: float | None = None
     energy_sd_model_error_N: float | None = None
-    """By noise, and by model error, noise included; None where that is not known."""
+    """Standard deviations by noise, and by model error including noise; None if unknown."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """What a specimen does under load."""
+    """Response of a specimen to its load."""
 
     critical_strain: float | None
-    """[-]; None where nothing becomes unstable."""
+    """Critical strain [-]; None if there is no instability."""
     states: tuple[StateNumbers, ...]
-    """At ascending strains."""
+    """States at ascending strains."""
     outcome: str = ""
-    """How far it was followed."""
+    """How far the path was followed."""
     critical_strain_sd: float | None = None
     critical_strain_sd_noise: float | None = None
     critical_strain_sd_model_error: float | None = None
 
     @property
     def values(self) -> FloatArray:
-        """(1 + 2 states,) critical strain, forces and energies, in one row; NaN for none."""
+        """(1 + 2 states,) critical strain, forces, energies; NaN without a critical strain."""
         critical = np.nan if self.critical_strain is None else self.critical_strain
         rows = [(s.force_N_per_mm, s.energy_N) for s in self.states]
         return np.concatenate([[critical], np.reshape(rows, (-1, 2)).T.ravel()])
 
     def values_at(self, other: Response) -> FloatArray:
-        """The same at the strains of another one; NaN at those that this one did not reach."""
+        """``values`` at the strains of another response; NaN at strains not reached."""
         found = {s.nominal_strain: s for s in self.states}
         lost = StateNumbers(np.nan, np.nan, np.nan)
         states = tuple(found.get(s.nominal_strain, lost) for s in other.states)
@@ -83,7 +83,7 @@ class Response:
 
 
 def direct_response(solution: Solution) -> Response:
-    """That of a direct simulation; of two states at a strain the buckled one counts."""
+    """The response of a direct simulation; of two states at a strain the buckled one is used."""
     states = {}
     for s in sorted(solution.snapshots, key=lambda s: s.branch != "primary"):
         numbers = s.nominal_strain, s.reaction, s.energy, s.branch, s.negative_pivots
@@ -98,22 +98,22 @@ class LatticeMode:
     """A mode of a specimen as a pattern of its infinite lattice."""
 
     measured: PlaneWaves
-    """In the lattice's coordinates, a hole's centre at the origin, as it was found."""
+    """As measured, in the lattice's coordinates: the origin is the centre of a hole."""
     snapped: PlaneWaves
-    """With wave vectors and phases of the lattice."""
+    """With the wave vectors and phases snapped to the lattice."""
 
     @classmethod
     def of(
         cls, mode: FourierMode, parameters: ArrayLike, specimen: Specimen, vectors: ArrayLike
     ) -> LatticeMode:
-        """Of a Fourier mode of a specimen; ``vectors`` (2, 2) of the RVE as rows [mm].
+        """From a Fourier mode of a specimen; ``vectors`` (2, 2): lattice vectors of the RVE [mm].
 
-        Phases are kept at the specimen's middle, where the origin is. InputError where a wave
-        vector is farther than a tenth from one that repeats on the RVE, or where snapping the
-        phases leaves another pattern.
+        Phases are kept at the specimen's centre, its origin. InputError if a wave vector differs
+        by more than a tenth from one that is periodic on the RVE, or if snapping the phases changes
+        the pattern.
         """
         waves, centres = mode.family.waves(parameters), specimen.hole_centres
-        hole = centres[int(np.argmin(np.linalg.norm(centres, axis=1)))]  # the first of several
+        hole = centres[int(np.argmin(np.linalg.norm(centres, axis=1)))]  # the first if several
         found = PlaneWaves.of_sines(waves, mode.half_wavelength, mode.scale).moved(-hole)
         return cls.of_waves(found, vectors, -hole)
 
@@ -121,7 +121,7 @@ class LatticeMode:
     def of_waves(
         cls, found: PlaneWaves, vectors: ArrayLike, about: ArrayLike = (0.0, 0.0)
     ) -> LatticeMode:
-        """Of waves in the lattice's coordinates, whose phases are kept at a point; as ``of``."""
+        """As :meth:`of`, from waves in the lattice's coordinates; phases are kept at ``about``."""
         mode_found = cls(found, snapped(found, vectors, about, inversion_centre=(0.0, 0.0)))
         as_found = snapped(found, vectors, about)
         a, b = (np.stack([w.cosine, w.sine]).ravel() for w in (mode_found.snapped, as_found))
@@ -136,14 +136,14 @@ class LatticeMode:
 
     @property
     def wave_change(self) -> FloatArray:
-        """(w,) changes of the wave vectors by snapping, over their lengths [-]."""
+        """(w,) changes of the wave vectors by snapping, relative to their lengths [-]."""
         k, to = self.measured.vectors, self.snapped.vectors
         return np.asarray(np.linalg.norm(to - k, axis=1) / np.linalg.norm(k, axis=1))
 
     def deviation(self, mode: FourierMode, covariance: FloatArray) -> float:
-        """By how many standard deviations snapping changes a wave vector, at most of all [-].
+        """Largest change of a wave vector by snapping, in standard deviations [-].
 
-        ``mode``: that was measured, ``covariance`` (m, m): of its parameters.
+        ``mode``: the measured mode; ``covariance`` (m, m): of its parameters.
         """
         slopes = mode.family.matrix.reshape(self.measured.vectors.shape[0], PER_WAVE, -1)[:, 2:4]
         change = (self.snapped.vectors - self.measured.vectors) * mode.half_wavelength / np.pi
@@ -151,32 +151,32 @@ class LatticeMode:
         return float(np.sqrt(np.einsum("wi,wij,wj->w", change, inverse, change)).max())
 
     def is_same(self, other: LatticeMode) -> bool:
-        """Whether snapping has made one pattern of both."""
+        """Whether both modes have the same pattern after snapping."""
         mine, its = (np.vstack(list(vars(mode.snapped).values())) for mode in (self, other))
         return bool(np.abs(mine - its).max() <= _SAME * np.abs(mine).max())
 
 
 @dataclass(frozen=True, eq=False)
 class ModeParameters:
-    """The parameters of measured modes with their covariances, whose names they have."""
+    """The parameters of measured modes with their covariances."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: FloatArray
-    """(m,)."""
+    """(m,) parameters."""
     by_noise: FloatArray
     by_model_error: FloatArray | None = None
-    """(m, m) covariances by noise, and by the residual cell by cell, noise included; None where
-    that is not known: a result without its images, a specimen of few cells."""
+    """(m, m) covariances by noise, and by model error including noise (from the residual by unit
+    cells). The latter is None if unknown: a result without its images, a specimen of few cells."""
     of_fields: FloatArray | None = None
-    """(n, n) the larger one of all the correlation's unknowns, v0's and v1's among them."""
+    """(n, n) the larger covariance of all unknowns of the correlation, including v0 and v1."""
     deviations: tuple[float, ...] = ()
-    """Of each mode by how many of its standard deviations snapping changed a wave vector, at most;
-    none where the model error is not known."""
+    """For each mode the largest change of a wave vector by snapping, in standard deviations; empty
+    if the model error is unknown."""
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> ModeParameters:
-        """From plain values."""
+        """From plain values, as read from JSON."""
         made = {"names": tuple, "units": tuple, "deviations": tuple}
         given = {k: v for k, v in content.items() if v is not None}
         known: dict[str, Any] = {k: made.get(k, np.array)(v) for k, v in given.items()}
@@ -184,28 +184,28 @@ class ModeParameters:
 
     @property
     def covariance(self) -> FloatArray:
-        """The larger one that is known."""
+        """The larger covariance that is known."""
         return self.by_noise if self.by_model_error is None else self.by_model_error
 
     @property
     def steps(self) -> FloatArray:
-        """(m,) changes by which differences are taken: a standard deviation, or a little more."""
+        """(m,) steps of finite differences: a standard deviation, at least _LEAST_STEP."""
         return np.asarray(np.maximum(_LEAST_STEP, np.sqrt(np.diag(self.covariance))))
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredModes:
-    """How snapped modes were measured, and how far their waves are known."""
+    """Snapped modes as functions of their measured parameters."""
 
     parameters: ModeParameters
-    """Of all of them."""
+    """Parameters of all modes."""
     modes: Callable[[FloatArray], Sequence[LatticeMode]]
-    """From parameters (m,), snapped."""
+    """The snapped modes for given parameters (m,)."""
 
     def derivatives(self, centre: ArrayLike) -> list[FloatArray]:
-        """(4 w, m) of each mode: its cosine and sine amplitudes, row by row, by the parameters.
+        """For each mode (4 w, m): derivatives of its cosine and sine amplitudes by the parameters.
 
-        Of waves whose origin is at a centre in the lattice's coordinates; by differences.
+        The waves' origin is at ``centre`` in the lattice's coordinates. By finite differences.
         """
 
         def amplitudes(values: FloatArray) -> list[FloatArray]:
@@ -222,30 +222,30 @@ class MeasuredModes:
 
 @dataclass(frozen=True)
 class ParameterEffect:
-    """What a parameter of the mode does to the response."""
+    """Effect of a parameter of a mode on the response."""
 
     name: str
     unit: str
     value: float
     sd_noise: float | None
     sd_model_error: float | None
-    """Of the parameter, by its two causes."""
+    """Standard deviations of the parameter by noise and by model error."""
     snapped: bool
-    """Whether snapping to the lattice has taken away all that the parameter does."""
+    """Whether the parameter has no effect after snapping to the lattice."""
     critical_strain: float | None
     force: tuple[float | None, ...]
     energy: tuple[float | None, ...]
     """Derivatives of the critical strain and of each state's force [N/mm] and energy [N]; None
-    where the specimen with the parameter changed did not come so far."""
+    where the path with the changed parameter did not reach the state."""
 
 
 def with_errors(
     response: Response, measured: MeasuredModes,
     predicted: Callable[[Sequence[LatticeMode]], Response],
 ) -> tuple[Response, tuple[ParameterEffect, ...]]:  # fmt: skip
-    """Propagate the covariance of the modes' parameters to the response that they themselves make.
+    """Propagate the covariance of the modes' parameters to the response of the measured modes.
 
-    ``predicted``: the response with modes; called once for each parameter that snapping leaves.
+    ``predicted``: gives the response for modes; called for each parameter that isn't snapped away.
     """
     parameters, modes = measured.parameters, measured.modes
     m, here = len(parameters.values), modes(parameters.values)

@@ -12,7 +12,7 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import OBSERVABLE
 
 _FIT = 3
-"""Images with a pattern that a pitchfork is fitted to, at least."""
+"""Least number of images with a pattern for the fit of a pitchfork."""
 
 
 @dataclass(frozen=True)
@@ -23,38 +23,38 @@ class ImageAmplitude:
     strain: float
     """Mean nominal compression of the cellular part, from v0 [-]."""
     amplitude_px: float
-    """Of v1 phi1 [px]; of several modes the root of their squares' sum."""
+    """Rms of v1 phi1; with several modes the root of the sum of their squares [px]."""
     model_error_px: float
     noise_px: float
     """Standard deviation of v1 phi1 by the images' noise [px]."""
 
     @property
     def has_pattern(self) -> bool:
-        """Whether the pattern stands out of noise and model error."""
+        """Whether the pattern exceeds noise and model error by the factor OBSERVABLE."""
         return self.amplitude_px > OBSERVABLE * max(self.model_error_px, self.noise_px)
 
 
 @dataclass(frozen=True)
 class Buckling:
-    """When the pattern appears."""
+    """Onset of the pattern in a sequence of images."""
 
     before: float
     after: float
     """Strains of the last image without a pattern and of the first with one [-]; NaN if there is
     none."""
     estimate: float
-    """Strain at which the pattern begins if its amplitude grows with the square root of the strain
-    beyond, as after a pitchfork bifurcation [-]; NaN with fewer than three images that have a
+    """Critical strain, assuming that the amplitude grows with the square root of the strain beyond
+    it, as after a pitchfork bifurcation [-]; NaN with fewer than three images that have a
     pattern."""
     text: str
-    """The numbers in words."""
+    """The result as text."""
 
 
 def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
     """Mean nominal compression along x and y of a part of the specimen [-].
 
-    The shortening of the distance between the means of opposite edges, moved by v0, over that
-    distance: a rotation is no strain.
+    The relative change of the distance between the mean positions of opposite edges, displaced by
+    v0. A rotation gives no strain.
     """
     along = np.linspace(0.02, 0.98, 33)
     x_sides = np.array([cellular.x_min, cellular.x_max])
@@ -71,9 +71,9 @@ def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
 
 
 def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:
-    """When the pattern appeared in a sequence of images, in the order of the test.
+    """Find the onset of the pattern in a sequence of images, in the order of the test.
 
-    A sequence that unloads again is read up to its largest strain.
+    If the specimen is unloaded again, only the images up to the largest strain are used.
     """
     nan = float("nan")
     last = int(np.argmax([m.strain for m in moments])) if moments else -1
@@ -96,7 +96,7 @@ def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:
 
 
 def _pitchfork(shown: Sequence[ImageAmplitude]) -> float:
-    """Where the squared amplitude, taken for linear in the strain, begins."""
+    """Strain at which the squared amplitude, fitted as linear in the strain, is zero [-]."""
     if len(shown) < _FIT:
         return float("nan")
     few = shown[:_FIT]

@@ -1,13 +1,13 @@
-"""The error of a measurement against a known displacement, in parts and in numbers.
+"""Error of a measurement against a known displacement: its parts and statistics.
 
 u_true - u_idic is what the paper calls the microfluctuation field w. It has two parts:
 
-* u_true - u_best, the model (ansatz) error: ``best`` is the ansatz' best possible fit to the truth;
-* u_best - u_idic, the measurement error on top of that.
+* u_true - u_best, the model (ansatz) error: u_best is the best possible fit of the ansatz;
+* u_best - u_idic, the additional measurement error.
 
-The grey-level residual is what remains visible of all this in the images. "rms" in this project is
+The grey-level residual shows the effect of both in the images. In this project, "rms" is
 *per component*: the root of the mean square over both components of all pixels, as grey-level noise
-or the noise of a local DIC is quoted. The rms of the vectors' length is sqrt(2) times that.
+or the noise of a local DIC is quoted. The rms of the vectors' length is sqrt(2) times as large.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ class VectorStatistics:
     median_length: float
     p95_length: float
     max_length: float
-    """The last four are of the vectors' Euclidean length."""
+    """The last four are statistics of the vectors' Euclidean length."""
 
     @classmethod
     def of(cls, field: FloatArray, mask: BoolArray, unit: float = 1.0) -> VectorStatistics:
-        """Of a field (rows, cols, 2) where a mask (rows, cols) is True, in a unit of that size."""
+        """Statistics of a field (rows, cols, 2) on a mask (rows, cols), divided by ``unit``."""
         x, y = (field[..., c][mask] / unit for c in (0, 1))
         mean_squares = float(x @ x) / x.size, float(y @ y) / y.size
         length = np.sqrt(x * x + y * y)
@@ -78,7 +78,7 @@ class Comparison:
     """Truth, measurement and best possible fit of one snapshot, in the reference frame."""
 
     strain: float
-    """Nominal [-]."""
+    """Nominal strain [-]."""
     grid: PixelGrid
     mask: BoolArray
     """(rows, cols) True on material of the reference image."""
@@ -86,11 +86,11 @@ class Comparison:
     """(rows, cols, 2) the truth [mm]; NaN outside the mask."""
     result: Result
     best: Result
-    """The best fit of the result's ansatz to it."""
+    """The measurement, and the best fit of its ansatz to the truth."""
     residual: FloatImage
     """(rows, cols) f - g(x + u) [grey levels, fraction of full scale]; NaN where not compared."""
 
-    # Made anew when asked for: that takes little time, and kept they are most of the memory.
+    # The error fields are recomputed at each access: that is fast, and storing them needs memory.
     @property
     def w(self) -> FloatArray:
         """(rows, cols, 2) microfluctuation field, truth - IDIC [mm]."""
@@ -103,12 +103,12 @@ class Comparison:
 
     @property
     def idic_to_best(self) -> FloatArray:
-        """(rows, cols, 2) IDIC - best fit [mm]: the measurement error; NaN off the mask."""
+        """(rows, cols, 2) IDIC - best fit [mm]: the measurement error; NaN outside the mask."""
         w = self.w
         return np.subtract(self.best_error, w, out=w)
 
     def _error(self, fit: Result) -> FloatArray:
-        """(rows, cols, 2) truth - fit [mm]; in bands: at all pixels a fit takes four times that."""
+        """(rows, cols, 2) truth - fit [mm]; by bands of rows, to save memory."""
         error = np.empty_like(self.displacement)
         for top in range(0, self.grid.rows, _BAND):
             rows = slice(top, top + _BAND)
@@ -117,7 +117,7 @@ class Comparison:
         return error
 
     def statistics(self) -> dict[str, VectorStatistics]:
-        """Of the error ``w`` and of its parts ``best_fit`` and ``idic_to_best_fit`` [px]."""
+        """Statistics of the error ``w`` and its parts ``best_fit``, ``idic_to_best_fit`` [px]."""
         parts = {"w": "w", "best_fit": "best_error", "idic_to_best_fit": "idic_to_best"}
         mask, px = self.mask, self.grid.pixel_size
         return {n: VectorStatistics.of(getattr(self, part), mask, px) for n, part in parts.items()}
@@ -128,13 +128,13 @@ class Comparison:
         return {"w_px": w, "model_error_px": model, "measurement_error_px": measurement}
 
     def cellular(self, specimen: Specimen) -> BoolArray:
-        """(rows, cols) True on material of the part with holes."""
+        """(rows, cols) True on material of the cellular part."""
         a, b = specimen.cellular_half_size
         x, y = np.abs(self.grid.x)[None, :], np.abs(self.grid.y)[:, None]
         return self.mask & (x <= a) & (y <= b)
 
     def v1_percent(self, specimen: Specimen) -> float:
-        """Rms difference of v1 from the best fit's over the cellular part, of its largest [%]."""
+        """Rms difference of v1 from the best fit's v1 over the cellular part [% of its maximum]."""
         inside = self.cellular(specimen)
         v, at_best = (fit.v(0)[inside] for fit in (self.result, self.best))
         return 100.0 * float(np.sqrt(np.mean((v - at_best) ** 2)) / np.abs(at_best).max())
@@ -143,10 +143,10 @@ class Comparison:
 def compare(
     images: ImageSet, strain: float, result: Result, start: FloatArray, camera: bool = False
 ) -> Comparison:
-    """Set a result against the truth of its image set.
+    """Compare a result with the truth of its image set.
 
-    ``start``: (n,) initial guess of the measurement; the best fit is searched from there and from
-    the result, and the better of the two is taken. ``camera``: whether of quantised images.
+    ``start``: (n,) initial guess of the measurement. The best fit is computed from there and from
+    the result; the one with the lower cost is used. ``camera``: whether the images are quantised.
     """
     grid, mask, truth = images.grid, images.mask(), images.truth(strain)
     best = best_fit(truth, result, guesses=(start,))
@@ -162,9 +162,9 @@ def pattern_field(result: Result, grid: PixelGrid | None = None) -> FloatArray:
 
 
 def pattern_size(comparison: Comparison, specimen: Specimen) -> tuple[float, float, float]:
-    """Largest length of the pattern, v1 phi1 or the sum of several modes, over material [px].
+    """Largest length of the pattern, v1 phi1 or the sum over several modes, over material [px].
 
-    In the cellular part, in it without its outermost ring of cells, and in its corner cells.
+    Three values: in the cellular part, without its outermost ring of cells, in its corner cells.
     """
     grid, (a, b) = comparison.grid, specimen.cellular_half_size
     x, y = np.abs(grid.x)[None, :], np.abs(grid.y)[:, None]

@@ -1,4 +1,4 @@
-"""The whole displacement: its numbers beside a correlation's, its errors against the truth."""
+"""The finite-element displacement: comparison with a correlation, errors against the truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NORMAL_95 = 1.959964
 class WholeFieldSummary:
     """Errors of the whole displacement, rms per component over the material's pixels.
 
-    Regions are those of scores. Two runs differ in nothing but ``seconds``.
+    Regions: see :mod:`modeharvest.validation.scoring.score`. Two runs differ only in ``seconds``.
     """
 
     rms_px: float = quantity("whole displacement: truth − measured, rms", "px")
@@ -37,34 +37,34 @@ class WholeFieldSummary:
     cutoff_px: float | None = quantity("… cut-off wavelength of the regularisation", "px")
     unknowns: int = quantity("… unknowns", "–")
     interval_coverage: float = quantity("… truth within 95 % intervals", "–")
-    """Share of the components of all pixels."""
+    """Fraction of the displacement components of all pixels."""
     interval_coverage_edges: float | None = quantity("… the same within 10 px of an edge", "–")
     contradicted: float | None = quantity("… nodes of free edges against the law", "–")
-    """Share where a material law changes u by more than 3 standard deviations; None without one."""
+    """Fraction of nodes where a material law changes u by over 3 sd; None without a law."""
     mode: tuple[float, ...]
     """Parameters of a single mode in the ansatz refitted to the whole displacement."""
     library: str
-    """That factorised the matrices."""
+    """Library that factorised the matrices."""
     warnings: tuple[str, ...]
     seconds: float | None = None
-    """Of a run's stage that measures all its images, on this machine: differs from run to run."""
+    """Time of the run's stage that measures all images, on this machine [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModeBothWays:
-    """A mode by correlation, and by the ansatz refitted to the whole displacement."""
+    """A mode from the correlation, and from the ansatz refitted to the whole displacement."""
 
     v_max_mm: float
     correlated_v_max_mm: float
-    """Largest |v| over the mode's own part [mm]."""
+    """Largest |v| over the part of the specimen where the mode is defined [mm]."""
     parameters: tuple[dict[str, Any], ...]
-    """Of each its ``name``, ``unit``, ``refitted`` value with its ``deviation`` (None if it isn't
-    determined), and ``correlated`` value."""
+    """For each parameter: ``name``, ``unit``, ``refitted`` value with its ``deviation`` (None if
+    not determined), and ``correlated`` value."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WholeFieldNumbers:
-    """What is known of a whole displacement without the truth; rms per component."""
+    """Numbers of a whole displacement without known truth; rms per component."""
 
     w_rms_px: float = quantity("w = measured − IDIC, rms", "px")
     w_max_px: float = quantity("… largest length", "px")
@@ -77,14 +77,14 @@ class WholeFieldNumbers:
     residual_rms: float = quantity("residual, rms", "levels; contours: px")
     modes: tuple[ModeBothWays, ...]
     library: str
-    """That factorised the matrices."""
+    """Library that factorised the matrices."""
     start: str
-    """Where the measurement began, in words."""
+    """Initial guess of the measurement, as text."""
     warnings: tuple[str, ...]
 
 
 def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> WholeFieldNumbers:
-    """Numbers of a whole displacement on the pixels of a mask, beside a correlation's result."""
+    """Numbers of a whole displacement on a mask's pixels, compared with a correlation's result."""
     measured, refit, px = whole.measured, whole.refit, correlated.grid.pixel_size
     u = measured.displacement_on(correlated.grid)
     there = mask & np.isfinite(u[..., 0])
@@ -115,20 +115,20 @@ def _both_ways(refit: Result, correlated: Result, i: int) -> ModeBothWays:
 
 
 def _amplitude(fit: Result, i: int) -> FloatArray:
-    """v of mode i over its own part [mm]."""
+    """v of mode i over the part of the specimen where the mode is defined [mm]."""
     box = fit.ansatz.modes[i].taper.cellular
     x, y = np.linspace(box.x_min, box.x_max, 200), np.linspace(box.y_min, box.y_max, 200)
     return fit.ansatz.v(i, fit.unknowns, x, y)
 
 
 def v_percent(fit: Result, best: Result, i: int = 0) -> float:
-    """Largest difference of v of mode i from that of the best fit, of its maximum [%]."""
+    """Largest difference of mode i's v from the best fit's [% of the latter's maximum]."""
     v, at_best = _amplitude(fit, i), _amplitude(best, i)
     return 100.0 * float(np.abs(v - at_best).max() / np.abs(at_best).max())
 
 
 def waves_percent(fit: Result, best: Result, i: int = 0) -> float:
-    """Largest difference of mode i's wave vectors from the best fit's, of their length [%]."""
+    """Largest difference of mode i's wave vectors from the best fit's [% of their length]."""
     family = best.ansatz.modes[i].family
     found, at_best = (family.waves(f.mode_parameters(i))[:, 2:4] for f in (fit, best))
     return 100.0 * float((lengths(found - at_best) / lengths(at_best)).max())
@@ -137,10 +137,10 @@ def waves_percent(fit: Result, best: Result, i: int = 0) -> float:
 def compare_whole(
     whole: WholeField, true: FloatArray, best: Result, mask: BoolArray, specimen: Specimen
 ) -> WholeFieldSummary:
-    """Set a whole displacement against the truth.
+    """Compare a whole displacement with the truth.
 
-    true : (rows, cols, 2) [mm].
-    best : the best fit to it of the ansatz that was refitted.
+    true : (rows, cols, 2) true displacement [mm].
+    best : the best fit, to the truth, of the ansatz refitted to the measurement.
     mask : (rows, cols) True on material of the undeformed specimen.
     """
     measured, refit, grid, px = whole.measured, whole.refit, best.grid, best.grid.pixel_size
@@ -165,7 +165,7 @@ def compare_whole(
 
 
 def _square_mode(refit: Result, pitch: float) -> tuple[float, ...]:
-    """Parameters of the paper's mode nearest to the ideal one; empty for other ansatzes."""
+    """Equivalent parameters of the paper's mode nearest to the ideal; empty for other ansatzes."""
     families = [mode.family for mode in refit.ansatz.modes]
     if [family.size for family in families] != [len(REFERENCE_MODE)]:
         return ()

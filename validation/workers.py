@@ -1,9 +1,9 @@
-"""Workers of a campaign: local processes or a dask scheduler's, and what they do with one case.
+"""Workers of a campaign: local processes or a dask scheduler's, and how they run a case.
 
-Processes of this machine are those of dask's own ``LocalCluster``. They listen on 127.0.0.1 only,
-have no dashboard, and no timeout takes a slow one for a dead one: a process that has ended is
-known by its end. Workers elsewhere are asked at once whether they can do the work at all. A worker
-imports this module and the case's function, nothing else of a campaign: it must start fast.
+Local processes are those of dask's ``LocalCluster``. They listen on 127.0.0.1 only, without a
+dashboard. No timeout declares a slow process dead: its end is detected from the process itself.
+Remote workers are first checked for whether they can run the function. A worker imports only this
+module and the case's function, because it must start fast.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from modeharvest.util.files import read_json, require_writable, write_json
 from modeharvest.util.stages import digest, source_digest, stage_key
 
 Case = Mapping[str, Any]
-"""Plain values, the seed among them."""
+"""Plain values, including the seed."""
 Cases = tuple[Case, ...]
 Row = dict[str, Any]
-"""What is found in a case, plain values by the columns of the table."""
+"""Result of a case: plain values by the columns of the table."""
 CaseFunction = Callable[[Case, Path], Row]
 """Takes a case and the campaign's folder."""
 
 
 def named(function: str) -> CaseFunction:
-    """The function that "package.module:name" stands for; InputError if there is none."""
+    """The function named "package.module:name"; InputError if there is none."""
     module, _, name = function.partition(":")
     try:
         found: CaseFunction = getattr(importlib.import_module(module), name)
@@ -50,15 +50,15 @@ def named(function: str) -> CaseFunction:
 
 
 def result_path(function: str, case: Case, folder: Path) -> Path:
-    """Where the result of a case is stored: under a digest of all that it depends on."""
+    """File for the result of a case, named by a digest of everything the result depends on."""
     key = stage_key([function, dict(case)])[:24]
     return folder / "cases" / f"{key}.json"
 
 
 def leave(content: Mapping[str, Any], folder: Path, path: str) -> str:
-    """Leave in a campaign's folder what cases read, under its digest; returns that, their name.
+    """Write input of cases to a campaign's folder, named by its digest; return the name.
 
-    ``path``: of the file in the folder, with {} for the name.
+    ``path``: path of the file in the folder, with {} for the name.
     """
     name = digest(content)[:16]
     write_json(folder / path.format(name), content)
@@ -66,12 +66,12 @@ def leave(content: Mapping[str, Any], folder: Path, path: str) -> str:
 
 
 def run_case(function: str, case: Case, folder: str, code: str) -> None:
-    """Run one case in a worker and store what becomes of it; nothing if it is stored as done.
+    """Run one case in a worker and store its result or failure; do nothing if it is already done.
 
-    Dask has a case run again whose worker dies before the campaign has heard that it is done.
+    Dask repeats a case whose worker dies before the campaign has received its result.
 
-    ``folder``: the campaign's, absolute, as a worker elsewhere has another current one; ``code``:
-    digest of the campaign's modeharvest, an InputError if this worker, which came later, differs.
+    ``folder``: absolute path of the campaign's folder, as remote workers have another current one;
+    ``code``: digest of the campaign's modeharvest; InputError if that of this worker differs.
     """
     if code != source_digest():
         raise InputError(
@@ -80,29 +80,29 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
     path = result_path(function, case, Path(folder))
     if read_result(path).get("error") == "":
         return
-    numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
+    numba.set_num_threads(1)  # also in a scheduler's workers, which may have no limit
     result, error = None, ""
     try:
         result = named(function)(case, Path(folder))
-    except Exception:  # a case may fail in any way: that is its result
+    except Exception:  # any failure of a case is its result
         error = traceback.format_exc()
     store(path, case, result, error)
 
 
 def store(path: Path, case: Case, result: Mapping[str, Any] | None, error: str) -> None:
-    """Write what became of a case: its result, or the traceback of its failure."""
+    """Write the result of a case, or the traceback of its failure."""
     content = {"version": __version__, "case": dict(case), "error": error, "result": result}
     write_json(path, {**content, "digest": digest(content)})
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """What is stored of a case, its ``error`` empty if it succeeded; empty if none, or damaged."""
+    """Stored record of a case; ``error`` is empty if it succeeded. {} if missing or damaged."""
     content = stored(path)
     return content if content.pop("digest", "") == digest(content) else {}
 
 
 def stored(path: Path) -> dict[str, Any]:
-    """What a case's file says, as it is; empty if nothing."""
+    """Content of a case's file, without a check; empty if there is none."""
     try:
         return dict(read_json(path))
     except (InputError, TypeError, ValueError):
@@ -110,31 +110,31 @@ def stored(path: Path) -> dict[str, Any]:
 
 
 _ATTEMPTS = 5
-"""To begin an event loop."""
+"""Attempts to start an event loop."""
 _PATIENCE_S = 30.0
-"""How long to wait for a scheduler that does not answer: it may be on a busy machine."""
+"""Time to wait for a scheduler's answer [s]: it may be on a busy machine."""
 _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS")}
-"""A worker has one thread: cores are shared out by cases. numba has it set in each case, because
-this stands in the parent's own environment for a while, where numba must not change its mind."""
+"""A worker has one thread, as cases run in parallel. For numba this is set in each case instead:
+these variables are temporarily set in the parent process too, whose numba must not change."""
 _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
 _LOOPBACK = "127.0.0.1"
 _MOST_WORKERS = 1000
 _LEAST_BYTES = 2**28
-"""Of a worker's memory: with less it is stopped, and begun again, before it has done anything."""
+"""Least memory of a worker: with less, dask restarts it before it has done anything."""
 LOCAL: dict[str, object] = {
-    # Forks of one server process, which has imported dask: quicker than new processes.
+    # Forks of one server process that has imported dask start faster than new processes.
     "distributed.worker.multiprocessing-method": "forkserver" if _FORKS else "spawn",
     "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
-    # Nobody need be reached through a network: who does not answer is slow. By default dask gives
-    # up a worker whose case keeps the interpreter for five minutes, and for good one that is not
+    # Without a network, a worker that does not answer is only slow. By default dask drops a worker
+    # whose case blocks the interpreter for five minutes, and drops for good one that is not
     # back 15 s after its process was killed.
     "distributed.scheduler.worker-ttl": None,
     "distributed.deploy.lost-worker-timeout": "1000 days",
     "distributed.comm.timeouts.connect": "10 minutes",
     "distributed.comm.timeouts.tcp": "1 hour",
-    # A case whose worker dies is tried once more beside others, then alone: see Campaign.
+    # A case whose worker dies is repeated once among others, then alone: see Campaign.
     "distributed.scheduler.allowed-failures": 1,
-    # Nothing to look at by HTTP.
+    # No HTTP pages.
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
 }
@@ -143,15 +143,15 @@ LOCAL: dict[str, object] = {
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work."""
+    """The processes that run a campaign's cases."""
 
     count: int = 2
-    """Of processes on this machine."""
+    """Number of processes on this machine."""
     memory: str = "4GiB"
-    """Most that each may take, e.g. "4GiB"; one that takes more is stopped and its case fails."""
+    """Memory limit of each, e.g. "4GiB"; a process above it is stopped and its case fails."""
     scheduler: str | None = None
-    """Instead, address of a dask scheduler, "tcp://host:8786", whose workers must see the folder
-    and have this modeharvest."""
+    """Address of a dask scheduler to use instead, "tcp://host:8786"; its workers must have access
+    to the folder and the same modeharvest."""
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -170,16 +170,16 @@ class Workers:
             ) from error
 
     def require_ready(self, function: str, folder: Path) -> None:
-        """Recognise workers elsewhere that can't do the work, before anything is made for them."""
+        """Raise InputError early if a scheduler's workers can't run the function."""
         if self.scheduler is not None:
             with self.client(function, folder):
                 pass
 
     @contextmanager
     def client(self, function: str, folder: Path) -> Iterator[Any]:
-        """A dask client of the workers, which end with it if they are of this machine.
+        """A dask client of the workers; local workers end with it.
 
-        InputError if the scheduler is not there, or its workers can't do the work.
+        InputError if the scheduler can't be reached, or its workers can't run the function.
         """
         if self.scheduler is None:
             with _processes(self.count, self.memory) as client:
@@ -192,7 +192,7 @@ class Workers:
 
 @contextmanager
 def _environment_kept() -> Iterator[None]:
-    """Undo dask's changes of the environment's variables."""
+    """Undo dask's changes of environment variables."""
     before = dict(os.environ)
     try:
         yield
@@ -203,11 +203,11 @@ def _environment_kept() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_deferred() -> Iterator[None]:
-    """Processes begun in here never hear Ctrl-C, which is for this one; it hears it afterwards."""
+    """Processes started in this context ignore Ctrl-C; this process receives it afterwards."""
     if not _FORKS:
         yield
         return
-    resource_tracker.ensure_running()  # its own start would let interrupts through again
+    resource_tracker.ensure_running()  # started later, it would unblock interrupts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -217,7 +217,7 @@ def _interrupts_deferred() -> Iterator[None]:
 
 @contextmanager
 def _processes(count: int, memory: str) -> Iterator[Any]:
-    """A client of processes of this machine."""
+    """A client of local processes."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -231,7 +231,7 @@ def _processes(count: int, memory: str) -> Iterator[Any]:
                 threads_per_worker=1,
                 memory_limit=memory,
                 host=_LOOPBACK,
-                # A free port, as campaigns may run side by side; None would take 8787.
+                # Any free port, as campaigns may run in parallel; None would use 8787.
                 dashboard_address=f"{_LOOPBACK}:0",
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
@@ -241,10 +241,10 @@ def _processes(count: int, memory: str) -> Iterator[Any]:
 
 
 def _begun(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Make a cluster or a client; again if its event loop takes more than dask's 10 s to begin."""
+    """Make a cluster or client; retry if its event loop takes over dask's 10 s to start."""
     for left in reversed(range(_ATTEMPTS)):
         gc.collect()
-        gc.disable()  # a client that failed, collected within, would close and wait for this one
+        gc.disable()  # collecting a failed client in here would wait for this one: deadlock
         try:
             return make(*arguments, **options)
         except AssertionError:
@@ -256,14 +256,14 @@ def _begun(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
 
 @contextmanager
 def _client_of(scheduler: str) -> Iterator[Any]:
-    """A client of a scheduler that runs already."""
+    """A client of a running scheduler."""
     from distributed import Client
 
-    for logger in ("distributed", "distributed.client"):  # what fails is one line
+    for logger in ("distributed", "distributed.client"):  # failures are reported in one line
         logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
         client = _begun(Client, scheduler, timeout=_PATIENCE_S)
-    except Exception as error:  # anything, where another kind of server answers
+    except Exception as error:  # another kind of server can cause any exception
         raise InputError(
             f"expected a dask scheduler at {scheduler}, got no answer that is one's; start one "
             "with 'dask scheduler', or leave the address out"
@@ -273,7 +273,7 @@ def _client_of(scheduler: str) -> Iterator[Any]:
 
 
 def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> None:
-    """Recognise workers without the function, with another modeharvest, or without the folder."""
+    """Raise InputError for workers without the function, the same modeharvest, or the folder."""
     require_writable(folder)
     folder = folder.resolve()
     with NamedTemporaryFile(dir=folder, prefix=".seen-") as mark:
@@ -304,7 +304,7 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
 
 
 def handshake(function: str, mark: str) -> tuple[str, str, bool]:
-    """A worker's version, code, and whether it can write where a file is."""
+    """A worker's version, code digest, and whether it can write to the folder of ``mark``."""
     named(function)
     sees = Path(mark).exists() and os.access(Path(mark).parent, os.W_OK)
     return __version__, source_digest(), sees

@@ -1,9 +1,9 @@
 """The first critical point of an infinite lattice: over all loads and all wave vectors.
 
-At every load the least stable wave is found: on a grid of the zone, from its best points on by
-descent along the eigenvalue's gradient, and for waves much longer than the cell by the acoustic
-tensor of the effective medium. Once it is unstable, its own critical load is found as a root, and
-all waves are looked at there again.
+At every load the least stable wave is found: on a grid of the zone, then by descent along the
+eigenvalue's gradient from the best grid points, and for waves much longer than the cell by the
+acoustic tensor of the effective medium. Once a wave is unstable, its critical load is found as a
+root, and all waves are examined again at that load.
 
 Wave vectors are phases (k . a1, k . a2) [rad]; k, -k and k plus 2 pi are the same mode.
 """
@@ -25,29 +25,29 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
-_FIRST_STEP, _TOLERANCE = 1e-3, 1e-10  # of the load: to begin with; of the critical one
-_CANDIDATES = 3  # grid points from which to descend
-_DEGENERATE = 1e-5  # of the measure at rest: values that far apart belong to one set
-_NOTHING = 1e-8  # of the moduli: what a mechanism's measure may be by rounding
-_BESIDE = 1e-6  # of the critical load: where the proof is made
+_FIRST_STEP, _TOLERANCE = 1e-3, 1e-10  # first step of the load; tolerance of the critical load
+_CANDIDATES = 3  # number of grid points from which to descend
+_DEGENERATE = 1e-5  # of the measure at rest: smaller values at the critical load are critical too
+_NOTHING = 1e-8  # of the moduli: a smaller measure at rest is rounding, the lattice a mechanism
+_BESIDE = 1e-6  # of the critical load: distance at which the inertia is checked
 
 
 @dataclass(frozen=True)
 class LeastStable:
-    """The wave that is nearest to instability at one load."""
+    """The wave nearest to instability at one load."""
 
     load: float
     value: float
-    """filling * lambda / |k|^2, with a |k|^2 that has the lattice's period; for long waves its
+    """Stability measure filling * lambda / |k|^2, with |k|^2 made periodic in k; for long waves its
     limit, the acoustic tensor's eigenvalue [MPa]. Negative: unstable."""
     wave: Wave
-    """Phases [rad]; (0, 0) for long waves and for modes with the cell's own period."""
+    """Phases [rad]; (0, 0) for long waves and for modes with the period of the cell."""
     angle: float | None = None
     """Direction of k for long waves [rad]; None otherwise."""
 
 
 class Zone:
-    """Stability over all waves, or some; an even number of ``divisions`` has M and X."""
+    """Stability over all waves, or some; even ``divisions`` have M and X on the grid."""
 
     def __init__(self, cell: PeriodicCell, divisions: int, only: Sequence[Wave] = ()) -> None:
         self.cell, self.only = cell, only
@@ -60,7 +60,7 @@ class Zone:
         self.grid = list(only) or self.grid
 
     def least_stable(self, state: CellState) -> LeastStable:
-        """The wave with the smallest measure, over all of the zone."""
+        """The wave with the smallest measure in the whole zone."""
         waves = BlochWaves(self.cell, state)
         if self.only:
             return min((self.at(waves, wave) for wave in self.only), key=lambda one: one.value)
@@ -84,13 +84,13 @@ class Zone:
         return np.array([self.measure(wave, float(value)) for wave, value in pairs])
 
     def measure(self, wave: Wave, eigenvalue: float) -> float:
-        """filling * lambda / |k|^2 [MPa]; for modes with the cell's period over 4 / area."""
+        """filling * lambda / |k|^2 [MPa]; for modes with the cell's period |k|^2 is 4 / area."""
         squared = self._squared(wave)[0]
         squared = squared if squared > 1e-12 else 4.0 / self.cell.cell.area
         return self.cell.filling * eigenvalue / squared
 
     def _squared(self, wave: Wave) -> tuple[float, FloatArray]:
-        """|k|^2 made periodic, k_i k_j being turned into cosines; and its gradient."""
+        """|k|^2 made periodic, with k_i k_j replaced by cosines; and its gradient."""
         g, mixed = self._metric, float(self._metric[0, 1])
         sign = -1.0 if mixed < 0 else 1.0
         weights = np.array([g[0, 0] - abs(mixed), g[1, 1] - abs(mixed), abs(mixed)])
@@ -100,7 +100,7 @@ class Zone:
         return float(weights @ (2.0 - 2.0 * np.cos(phases))), gradient
 
     def _descend(self, waves: BlochWaves, start: Wave, value: float) -> tuple[float, Wave]:
-        """A local minimum of the measure near a grid point, whose value is known."""
+        """A local minimum of the measure near a grid point with known value."""
         near: list[BlochModes] = []
 
         def measure(point: FloatArray) -> tuple[float, FloatArray]:
@@ -112,14 +112,14 @@ class Zone:
             value = self.measure(wave, float(modes.eigenvalues[0]))
             return value, self.cell.filling * slope / squared
 
-        # Off the grid, where symmetry may make a saddle look like a minimum; not as far as the
-        # next points, one of which may be Γ.
+        # Start off the grid, as by symmetry a saddle there may look like a minimum, but closer
+        # than the next points, one of which may be Γ.
         reach = 0.9 * self._spacing
         bounds = [(phase - reach, phase + reach) for phase in start]
         offset = np.add(start, [0.11, 0.07])
         found = minimize(measure, offset, jac=True, method="L-BFGS-B", bounds=bounds)
         wave = (float(found.x[0]), float(found.x[1]))
-        # The grid point itself, if it is as good: exactly M rather than nearly.
+        # Prefer the grid point itself if it is as good: exactly M rather than nearly M.
         if found.fun < value - 1e-9 * abs(value) and not is_same(wave, start):
             return float(found.fun), folded(wave)
         return value, start
@@ -127,36 +127,36 @@ class Zone:
 
 @dataclass(frozen=True, eq=False)
 class LatticeCritical:
-    """Where a lattice first becomes unstable, or how far it was found to be stable."""
+    """The point where a lattice first becomes unstable, or up to which it is stable."""
 
     load: float
     """Critical load; without one, the last load reached [-]."""
     found: bool
     """Whether there is a critical point up to ``load``."""
     outcome: str
-    """What was found, as a sentence."""
+    """The result as text."""
     least_stable: LeastStable
     """The least stable wave at ``load``."""
     waves: tuple[Wave, ...]
-    """All waves that are critical at ``load``: a degenerate set has more than one. They are on the
-    grid, or images of the least stable one under symmetries of lattice and load, even if the mesh
+    """All waves that are critical at ``load``; a degenerate set has more than one. They are on the
+    grid, or images of the least stable wave under symmetries of lattice and load, even if the mesh
     splits them slightly. k and -k are the same mode and appear once. Empty for long waves."""
     state: CellState
     """The equilibrium at ``load``."""
     history: tuple[LeastStable, ...]
-    """The least stable wave at every load at which all were looked at, by load."""
+    """The least stable wave at every load at which all waves were examined, by load."""
     below: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
-    """Number of negative eigenvalues at each of ``waves`` a millionth of the load below and above
-    the critical one: the proof."""
+    """Number of negative eigenvalues at each of ``waves``, a millionth of the load below and above
+    the critical load: the proof."""
     splitting: float = 0.0
-    """Largest measure among ``waves`` over what it is without load: by how much the mesh splits
-    modes that the lattice's symmetry makes equal [-]."""
+    """Largest measure among ``waves``, over the measure without load: splitting by the mesh of
+    modes that are degenerate by the lattice's symmetry [-]."""
     splitting_bound: float = 0.0
-    """The same by images of the lowest mode, an upper bound by the min-max principle."""
+    """Upper bound of ``splitting`` from images of the lowest mode, by the min-max principle."""
     unstable_before: tuple[Wave, ...] = ()
-    """Waves of the grid that are unstable already a millionth of the load below: this is the first
-    critical point if there are none. Not looked for where one wave was given."""
+    """Waves of the grid that are already unstable a millionth of the load below. If there are none,
+    this is the first critical point. Not computed if one wave was given."""
 
 
 def first_critical(
@@ -164,8 +164,8 @@ def first_critical(
 ) -> LatticeCritical:
     """The first critical load over all wave vectors, along the path of a primitive cell.
 
-    Or over those that the search names. A mode of the cell's own period has the wave (0, 0).
-    InputError if the lattice is a mechanism: a wave costs no energy without load.
+    If the search names waves, only over these. Modes with the period of the cell have the wave
+    (0, 0). InputError if the lattice is a mechanism: a wave needs no energy without load.
     """
     search = search or CriticalSearch()
     zone = Zone(path.cell, search.divisions, search.phases)
@@ -175,9 +175,9 @@ def first_critical(
 def critical_at(
     path: CellPath, wave: Wave, search: CriticalSearch | None = None
 ) -> LatticeCritical:
-    """The first load at which the given wave is critical, whatever the others do.
+    """The first load at which the given wave is critical, regardless of other waves.
 
-    (0, 0) stands for the modes with the period of the cell, which may be an enlarged one. F̄ is
+    (0, 0) means modes with the period of the cell, which may be an enlarged cell. F̄ is
     fixed while a mode grows.
     """
     search = search or CriticalSearch()
@@ -204,7 +204,7 @@ class _LoadSearch:
             target = min(load + step, largest)
             least = self._measured(self.path.at(target))
             path_ends = least is None
-            if least is None:  # somewhere between: the path ends before it
+            if least is None:  # the path ends before the target
                 target = max(state.load for state in self.path.states)
                 least = self._measured(self.path.at(target))
             assert least is not None, "a state that is known"
@@ -237,7 +237,7 @@ class _LoadSearch:
     def _root(self, low: float, high: float) -> LatticeCritical:
         """The critical point between a stable and an unstable load.
 
-        All waves are looked at where the least stable one of before is critical by itself.
+        All waves are examined again at the critical load of the previous least stable wave.
         """
         last, load, exact = math.inf, high, _TOLERANCE * self.history[0.0].value
         while last - load > _TOLERANCE * load and self.history[load].value < -exact:
@@ -257,7 +257,7 @@ class _LoadSearch:
         return LatticeCritical(load, True, text, least, *known)
 
     def _critical_load(self, least: LeastStable, low: float, high: float) -> float:
-        """Where a wave that is unstable at a load is critical."""
+        """Critical load of a wave that is unstable at the load ``high``."""
 
         def value(load: float) -> float:
             waves, angle = BlochWaves(self.path.cell, self._near(low, load)), least.angle
@@ -266,9 +266,9 @@ class _LoadSearch:
         return float(brentq(value, low, high, xtol=_TOLERANCE * high, rtol=1e-14))
 
     def _near(self, low: float, load: float) -> CellState:
-        """The equilibrium at a load near the critical one, reached from the stable side afresh.
+        """The equilibrium at a load near the critical load, computed from the stable side.
 
-        Not from the nearest state: if that is critical with the cell's own period, its
+        It doesn't start at the nearest state: if that is critical with the period of the cell, its
         tangent is singular, and Newton's method may slip onto the branch.
         """
         start = self.path.at(low)
@@ -290,9 +290,9 @@ class _LoadSearch:
         return f"; looked for at the {count} wave(s) asked for only" if count else ""
 
     def _set(self, state: CellState, least: LeastStable) -> tuple[tuple[Wave, ...], float, float]:
-        """The least stable wave and those that are critical with it; how far the mesh splits them.
+        """The least stable wave and others critical with it; their splitting and its bound.
 
-        They are critical at the same points of the grid, or images by symmetry.
+        The others are critical points of the grid, or images of the wave by symmetry.
         """
         waves, rest = BlochWaves(self.path.cell, state), self.history[0.0].value
         small = np.abs(self.zone.on_grid(waves)) < _DEGENERATE * rest
@@ -307,7 +307,7 @@ class _LoadSearch:
         return tuple(found), split, max(bound, split)
 
     def _unstable(self, state: CellState, critical: tuple[Wave, ...]) -> tuple[int, ...]:
-        """Negative eigenvalues at the critical waves; at Γ the translations don't count."""
+        """Number of negative eigenvalues at the critical waves; at Γ without translations."""
         waves = BlochWaves(self.path.cell, state)
         return tuple(
             int(np.sum(waves.lowest(CENTRE, 4).eigenvalues < 0)) if wave == CENTRE

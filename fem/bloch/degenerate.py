@@ -1,8 +1,8 @@
-"""Modes that belong together by the symmetry of a lattice, whatever mesh it has.
+"""Modes that are degenerate by the symmetry of a lattice, independent of its mesh.
 
-A mesh without the geometry's symmetry splits degenerate modes slightly. Here modes are carried
-along by the symmetries (``fem.lattice.symmetry``), interpolated in the elements: so a set is
-recognised by what it is, and not by a tolerance of eigenvalues. By the min-max principle the
+A mesh without the geometry's symmetry splits degenerate modes slightly. Here modes are transformed
+by the symmetries (``fem.lattice.symmetry``) and interpolated in the elements. So degenerate sets
+are recognised by symmetry, not by a tolerance of eigenvalues. By the min-max principle, the
 Rayleigh quotient of a mode's image is an upper bound of its partner's eigenvalue.
 """
 
@@ -27,15 +27,15 @@ from modeharvest.fem.lattice.symmetry import Symmetry
 from modeharvest.util.arrays import FloatArray, IntArray
 
 Vectors = NDArray[Any]  # real or complex
-_NEIGHBOURS = 16  # elements in one of which a point is looked for
-_CLOSED = 0.8  # of an image's square: what of it is within a set that is complete
-_SAME = 1e-3  # phases [rad] that far apart are the same wave
-_ALIKE = 0.25  # distance of unit vectors: combinations that near are the same
-_MOST_MODES, _MOST_BRANCHES = 4, 12  # for which all combinations of signs are looked at; followed
+_NEIGHBOURS = 16  # number of nearest elements in which a point is searched for
+_CLOSED = 0.8  # least share of an image's square norm within a complete set
+_SAME = 1e-3  # phase differences [rad] below which two waves are the same
+_ALIKE = 0.25  # distance of unit vectors below which two combinations are the same
+_MOST_MODES, _MOST_BRANCHES = 4, 12  # most modes to combine with all signs; most combinations
 
 
 class Transport:
-    """Carries fields on a cell along by maps of its lattice onto itself."""
+    """Transforms fields on a cell by maps of its lattice onto itself."""
 
     def __init__(self, cell: PeriodicCell) -> None:
         self.cell, mesh, self._lattice = cell, cell.cell.mesh, cell.cell.lattice
@@ -45,14 +45,14 @@ class Transport:
         self._nodes = self._tiled(mesh.nodes)
 
     def _tiled(self, points: FloatArray) -> tuple[cKDTree, IntArray]:
-        """A tree of all copies near the lattice's first cell; shifts (9, n, 2) of each of them."""
+        """A tree of all copies near the lattice's first cell, and their shifts (9 n, 2)."""
         own = np.floor(points @ self._inverse)
         shift = np.array(list(product((-1, 0, 1), repeat=2)))[:, None] - own
         tiles = (points + shift @ self._lattice).reshape(-1, 2)
         return cKDTree(tiles), shift.reshape(-1, 2).astype(np.int64)
 
     def _located(self, points: FloatArray) -> tuple[IntArray, FloatArray, IntArray]:
-        """Nodes (p, 6), weights (p, 6), and the cells (p, 2) in which points are."""
+        """For each point: nodes (p, 6), weights (p, 6), and the copy of the cell (p, 2)."""
         cells, count = self.cell.cell.mesh.cells, len(self._corners)
         turns = np.floor(points @ self._inverse).astype(np.int64)
         inside = points - turns @ self._lattice
@@ -68,7 +68,7 @@ class Transport:
         L, element = part[row, best], near[row, best]
         weights = np.hstack([L * (2.0 * L - 1.0), 4.0 * L * np.roll(L, -1, axis=1)])
         nodes, copies = cells[element % count], shift[element] + turns
-        # Where a node lies upon a node nothing has to be interpolated.
+        # A point that coincides with a node needs no interpolation.
         tree, shift = self._nodes
         away, nearest = tree.query(inside)
         same = np.flatnonzero(away < 1e-6 * np.abs(self._lattice).max())
@@ -78,7 +78,7 @@ class Transport:
         return nodes, weights, copies
 
     def image(self, vectors: Vectors, wave: Wave, by: Symmetry) -> tuple[Vectors, Wave]:
-        """Reduced vectors (size, m) of a wave as a map carries them, and their new wave [rad]."""
+        """Images of a wave's reduced vectors (size, m) under a map, and their wave [rad]."""
         reduction, nodes = self.cell.reduction, self.cell.cell.mesh.nodes
         master = reduction.periodicity.master
         places = nodes[np.unique(master, return_index=True)[1]]
@@ -93,13 +93,13 @@ class Transport:
         return found, (float(to[0]), float(to[1]))
 
     def keeps_cells(self, by: Symmetry) -> bool:
-        """Whether a map carries the lattice of this cell onto itself, and not only a finer one."""
+        """Whether a map preserves the lattice of this cell, not only a finer lattice."""
         steps = self._lattice @ by.turn.T @ self._inverse
         return bool(np.abs(steps - np.rint(steps)).max() < 1e-4)
 
 
 class Degeneracy:
-    """What belongs together by symmetry among the Bloch modes of one state of a lattice."""
+    """Degeneracy by symmetry among the Bloch modes of one state of a lattice."""
 
     def __init__(self, bloch: BlochWaves) -> None:
         self.bloch, self.cell = bloch, bloch.cell
@@ -111,7 +111,7 @@ class Degeneracy:
         return Transport(self.cell)
 
     def waves(self, wave: Wave) -> list[Wave]:
-        """All waves that symmetries of lattice and load make of one, itself first."""
+        """All images of a wave under symmetries of lattice and load, the wave itself first."""
         lattice, found = self.cell.cell.lattice, [wave]
         for by in self._kept:
             image = folded(lattice @ by.turn @ np.linalg.inv(lattice) @ np.asarray(wave))
@@ -120,7 +120,7 @@ class Degeneracy:
         return found
 
     def count(self, lowest: BlochModes, least: int) -> int:
-        """How many of the lowest modes at one wave are a set, ``least`` of which are one anyway."""
+        """Number of the lowest modes at a wave that form a degenerate set, at least ``least``."""
         most = lowest.vectors.shape[1]
         return next((n for n in range(least, most) if self._is_closed(lowest, n)), least)
 
@@ -134,7 +134,7 @@ class Degeneracy:
         return max(bounds)
 
     def _is_closed(self, modes: BlochModes, count: int) -> bool:
-        """Whether the first modes are each other's images under all maps that keep their wave."""
+        """Whether maps that keep the wave transform the first ``count`` modes among themselves."""
         vectors, M = modes.vectors[:, :count], self.cell.mass(modes.wave)
         for by in self._kept:
             images, wave = self._transport.image(vectors, modes.wave, by)
@@ -149,18 +149,18 @@ class Degeneracy:
 
 
 def distinct_combinations(cell: PeriodicCell, modes: ModeSet) -> tuple[tuple[float, ...], ...]:
-    """Combinations of critical modes whose branches no symmetry of lattice and load makes equal.
+    """Combinations of critical modes whose branches are not related by symmetry.
 
-    Of all with coefficients 0, 1 and -1, those of few modes first. ``cell`` is the commensurate one
-    that the modes live on. A mode and its opposite are two where nothing carries one to the other.
-    With more than four modes, or a dozen combinations, those of each mode alone, and of all.
+    Coefficients are 0, 1 and -1; combinations of few modes come first. ``cell``: the commensurate
+    cell of the modes. A mode and its opposite are distinct unless a symmetry of lattice and load
+    relates them. With over four modes or a dozen combinations: each mode alone, and their sum.
     """
     count = len(modes.waves)
     alone = [tuple(float(i == k) for i in range(count)) for k in range(count)]
     few = (*alone, (1.0,) * count) if count > 1 else tuple(alone)
     if count > _MOST_MODES:
         return few
-    maps = _actions(cell, modes)  # that of the identity is among them
+    maps = _actions(cell, modes)  # including the identity
     rows = [row for row in product((1.0, 0.0, -1.0), repeat=count) if any(row)]
     rows.sort(key=lambda row: (np.count_nonzero(row), sum(c < 0 for c in row)))
     units = np.array(rows) / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -171,7 +171,7 @@ def distinct_combinations(cell: PeriodicCell, modes: ModeSet) -> tuple[tuple[flo
 
 
 def _actions(cell: PeriodicCell, modes: ModeSet) -> FloatArray:
-    """(g, m, m) how the maps that leave lattice and load as they are mix modes."""
+    """(g, m, m) matrices by which the symmetries of lattice and load act on the modes."""
     transport, symmetry, reduction = Transport(cell), cell.cell.symmetry, cell.reduction
     first = np.unique(reduction.periodicity.master, return_index=True)[1]
     shapes = modes.shapes[:, first].reshape(len(modes.waves), -1).T[reduction.order]
@@ -183,7 +183,7 @@ def _actions(cell: PeriodicCell, modes: ModeSet) -> FloatArray:
 
 
 def folded(wave: Sequence[float] | FloatArray) -> Wave:
-    """The same wave with both phases in (-pi, pi], without rounding beside multiples of pi."""
+    """The same wave with both phases in (-pi, pi]; exact near multiples of pi."""
     phases = np.asarray(wave, dtype=np.float64)
     turns = np.rint(phases / np.pi)
     exact = np.where(np.abs(phases - np.pi * turns) < 1e-9, np.pi * turns, phases)
@@ -192,6 +192,6 @@ def folded(wave: Sequence[float] | FloatArray) -> Wave:
 
 
 def is_same(a: Wave, b: Wave, signs: Sequence[float] = (1.0, -1.0)) -> bool:
-    """Whether two waves are the same one, or each other's opposites."""
+    """Whether two waves are equal, or opposite (by default ``signs``)."""
     apart = (folded((a[0] - s * b[0], a[1] - s * b[1])) for s in signs)
     return any(max(abs(p), abs(q)) < _SAME for p, q in apart)

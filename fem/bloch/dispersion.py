@@ -1,7 +1,7 @@
-"""The dispersion of a lattice under load: lowest eigenvalues against the wave vector.
+"""The dispersion of a lattice under load: lowest eigenvalues as functions of the wave vector.
 
-Along a path through the zone at several loads, and over the whole zone at one. What is found is
-plain numpy, written and read without dolfinx.
+They are computed along a path through the zone at several loads, and over the whole zone at one
+load. Results are plain numpy, written and read without dolfinx.
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ ZONES: dict[str, tuple[tuple[str, Wave], ...]] = {
 }
 """Closed tours of a zone by its symmetry, corners as phases (k . a1, k . a2) [rad].
 
-"square" and "hexagonal" (60 degrees between a1 and a2): a quarter and a sixth of a turn leave the
-lattice under its load as it is. "rhombic": the hexagonal lattice under a load that doesn't, K at
-0 and K′ at 60 degrees from x, M₁ at 30 and M₂ at 90. "oblique": anything else; with k and -k the
-same, the edges X-M and Y-M are all of the boundary."""
+"square" and "hexagonal" (60 degrees between a1 and a2): rotations by 90 and 60 degrees preserve
+the lattice under its load. "rhombic": the hexagonal lattice under a load without this symmetry, K
+at 0 and K′ at 60 degrees from x, M₁ at 30 and M₂ at 90. "oblique": any other; as k and -k are
+equivalent, the edges X-M and Y-M are the whole boundary."""
 
 _ARRAYS = ("waves", "distances", "loads", "eigenvalues")
 
 
 @dataclass(frozen=True, eq=False)
 class ZoneMap:
-    """The lowest eigenvalue over all of the zone at one load [-]."""
+    """The lowest eigenvalue over the whole zone at one load [-]."""
 
     load: float
     phases: FloatArray
-    """(g,) from -pi to pi, of k . a1 and of k . a2 alike [rad]."""
+    """(g,) grid of both phases k . a1 and k . a2, from -pi to pi [rad]."""
     eigenvalues: FloatArray
-    """(g, g) [N/mm^4]; the first index is k . a1. At (0, 0), a translation, it is 0."""
+    """(g, g) [N/mm^4]; the first index is k . a1. 0 at (0, 0), a translation."""
     lattice: FloatArray
     """(2, 2) lattice vectors as rows [mm]: k = phases . inv(lattice).T [rad/mm]."""
 
     @property
     def least_stable(self) -> tuple[float, Wave]:
-        """The eigenvalue [N/mm^4] and phases [rad] of the lowest lambda / |k|^2, Γ left out."""
+        """Eigenvalue [N/mm^4] and phases [rad] of the lowest lambda / |k|^2, excluding Γ."""
         half = self.phases[1:]  # -pi and pi are the same
         turns = 2.0 * _PI * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
         grid = np.stack(np.meshgrid(half, half, indexing="ij"), axis=-1)
@@ -82,15 +82,15 @@ class Dispersion:
     labels: tuple[str, ...]
     """Names of the path's corners."""
     stops: tuple[int, ...]
-    """Places of the corners among the path's points."""
+    """Indices of the corners among the path's points."""
     waves: FloatArray
     """(p, 2) phases [rad]."""
     distances: FloatArray
-    """(p,) length of the path [rad/mm]."""
+    """(p,) length along the path [rad/mm]."""
     loads: FloatArray
-    """(s,) [-]."""
+    """(s,) loads [-]."""
     eigenvalues: FloatArray
-    """(s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them."""
+    """(s, p, bands) ascending [N/mm^4]; at Γ including the zeros of translations."""
     zone: tuple[ZoneMap, ...] = ()
     """Maps of the zone, one for each requested load."""
 
@@ -108,7 +108,7 @@ class Dispersion:
         return int(self.eigenvalues.shape[2])
 
     def write(self, path: Path | str) -> None:
-        """Write an HDF5 file, atomically: the arrays above by name, maps in ``zone/0``, ..."""
+        """Write an HDF5 file atomically: these arrays by name, maps in ``zone/0``, ..."""
         with atomic_hdf5(path) as file:
             file.attrs["labels"] = list(self.labels)
             file["stops"] = np.array(self.stops)
@@ -119,7 +119,7 @@ class Dispersion:
 
     @classmethod
     def read(cls, path: Path | str) -> Dispersion:
-        """Read what ``write`` wrote; an InputError refuses any other file."""
+        """Read a file of ``write``; InputError for any other file."""
         with open_hdf5(path, "a dispersion file (HDF5)") as file:
             arrays = {name: file[name][()] for name in _ARRAYS}
             labels, stops = tuple(map(str, file.attrs["labels"])), tuple(map(int, file["stops"]))
@@ -137,10 +137,10 @@ def dispersion(
 ) -> Dispersion:
     """The lowest eigenvalues along a zone path, at several loads [-] of a primitive cell's path.
 
-    An InputError refuses other wave vectors than two finite phases, and loads out of reach.
+    InputError for wave vectors that aren't two finite phases, and for loads out of reach.
 
     corners : names and phases [rad] of the path's corners, such as ``ZONES["square"]``.
-    count, bands : number of wave vectors, corners included, and of eigenvalues at each.
+    count, bands : number of wave vectors, including corners, and of eigenvalues at each.
     """
     from modeharvest.fem.bloch.eigen import BlochWaves
 
@@ -164,9 +164,9 @@ def zone_path(
 ) -> tuple[list[Wave], list[int]]:
     """``count`` wave vectors through the corners of a zone, about evenly spaced.
 
-    ``corners`` are names and phases [rad], such as ``ZONES["square"]``, ``lattice`` (2, 2) the
-    vectors as rows [mm]. Returns phases [rad], and the places of the corners among them. An
-    InputError refuses fewer than two corners, or fewer points than corners.
+    ``corners``: names and phases [rad], such as ``ZONES["square"]``; ``lattice`` (2, 2): lattice
+    vectors as rows [mm]. Returns phases [rad], and the indices of the corners among them.
+    InputError for fewer than two corners, or fewer points than corners.
     """
     if len(corners) < 2 or count < len(corners):
         what = "two corners or more and at least as many points"
@@ -190,8 +190,8 @@ def zone_map(
 ) -> ZoneMap:
     """The lowest eigenvalue over a grid of the zone at one load [-] of a primitive cell's path.
 
-    An even number of ``divisions`` of each axis has Γ, X and M on the grid; an InputError refuses
-    an odd one, and a load that can't be reached.
+    ``divisions`` of each axis must be even, so that Γ, X and M are on the grid; InputError if it is
+    odd, or if the load can't be reached.
     """
     from modeharvest.fem.bloch.eigen import BlochWaves
 
@@ -201,7 +201,7 @@ def zone_map(
     phases = np.asarray(np.linspace(-_PI, _PI, divisions + 1), dtype=np.float64)
     phases[divisions // 2] = 0.0
     values = np.empty((divisions + 1, divisions + 1))
-    # k and -k are the same: the rows from -pi to 0 are all rows.
+    # k and -k are equivalent: the rows from -pi to 0 are sufficient.
     half = divisions // 2 + 1
     for i in range(half):
         progress(i, half, "zone map")
@@ -223,7 +223,7 @@ def _state(path: CellPath, load: float) -> CellState:
 
 
 def _along(waves: BlochWaves, points: Sequence[Wave], bands: int) -> FloatArray:
-    """(p, bands) eigenvalues, the translations' two zeros among those of Γ."""
+    """(p, bands) eigenvalues; those at Γ include the two zeros of translations."""
     from modeharvest.fem.bloch.eigen import scan
 
     centre = np.abs(points).max(axis=1) < 1e-12

@@ -1,8 +1,8 @@
 """Bloch waves on a deformed lattice: their lowest eigenvalues, for any wave vector.
 
-K x = lambda M x with both matrices reduced by T(k)^H . T(k) to the primitive cell; a wave of
-negative lambda grows. Wave vectors are given as phases from cell to cell, (k . a1, k . a2) in rad.
-Eigenpairs are found by Lanczos' method in blocks, for many wave vectors at once.
+K x = lambda M x with both matrices reduced by T(k)^H . T(k) to the primitive cell; a wave with
+negative lambda grows. Wave vectors are given as phases from cell to cell, (k . a1, k . a2) [rad].
+Eigenpairs are computed by a block Lanczos method, for many wave vectors at once.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from modeharvest.fem.sparse_factor import negative_pivots
 from modeharvest.util.arrays import FloatArray
 
 _SCAN_TOLERANCE = 1e-10  # of lambda + s, relative
-_BATCH = 30  # waves iterated at once: more would only take more memory
-_NOISE = 0.2  # in a start vector, relative
-_DIRECTIONS = 36  # over half a turn
+_BATCH = 30  # number of waves iterated at once; more only need more memory
+_NOISE = 0.2  # relative noise in a start vector
+_DIRECTIONS = 36  # number of directions over 180 degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +47,13 @@ class BlochModes:
 
 
 class BlochWaves:
-    """All Bloch waves on one state of a primitive cell; counts factorisations of its matrices."""
+    """Bloch waves on one state of a primitive cell; counts factorisations of its matrices."""
 
     def __init__(self, cell: PeriodicCell, state: CellState) -> None:
         self.cell, self.state = cell, state
         self.stiffness = cell.reduction.reduced(state.stiffness)
         self.factorisations = 0
-        # Eigenvalues are looked for from below, so that Γ with its translations is regular.
+        # A shift below the spectrum keeps Γ, with its translations, regular.
         scale = np.linalg.norm(state.moduli.ravel()) / (cell.filling * cell.cell.area)
         self._below = 0.02 * float(scale)
         self._condense()
@@ -64,8 +64,8 @@ class BlochWaves:
         """The ``count`` lowest eigenpairs, at Γ without the two translations.
 
         Lanczos with the inverse of K + s M; s is so large that this is positive definite, which its
-        factors prove, so the eigenvalues nearest to -s are the lowest. ``near`` are those of a wave
-        vector nearby, as a start; ``tolerance`` is about the relative error of lambda + s.
+        factors prove, so the eigenvalues nearest to -s are the lowest. ``near``: modes of a nearby
+        wave vector as start; ``tolerance``: approximate relative error of lambda + s.
         """
         values, vectors = self.iterated(phases_of([wave]), count, near, tolerance)
         return BlochModes(wave, values[0], vectors[:, 0])
@@ -73,9 +73,9 @@ class BlochWaves:
     def iterated(
         self, waves: FloatArray, count: int, near: BlochModes | None, tolerance: float
     ) -> tuple[FloatArray, Batch]:
-        """Values (w, count) and vectors (size, w, count) of ``lowest`` for several waves.
+        """Values (w, count) and vectors (size, w, count) as of ``lowest`` for several waves.
 
-        Their phases (w, 2) [rad] are all Γ, all where T(k) is real, or all elsewhere.
+        ``waves``: phases (w, 2) [rad] of one kind: all Γ, all others with real T(k), or all others.
         """
         solver, below = self._solver_below(waves)
         T = self.cell.reduction.bloch_map.at(waves)
@@ -98,7 +98,7 @@ class BlochWaves:
         return negative_pivots(factorise(self.stiffness(wave_of(wave))))
 
     def unstable_among(self, points: Sequence[Wave]) -> tuple[Wave, ...]:
-        """Those wave vectors but Γ at which K is not positive definite: proven by Cholesky."""
+        """The wave vectors except Γ at which K isn't positive definite, proved by Cholesky."""
         self.factorisations += 1
         condensation = Condensation(self.state.stiffness, self.cell.reduction.boundary)
         waves = phases_of(points)
@@ -112,7 +112,7 @@ class BlochWaves:
         vector = u.reshape(-1, 1, 1)
         forces = applied(self.state.stiffness.__matmul__, vector)
         forces -= modes.eigenvalues[0] * applied(self.cell.nodal_mass.__matmul__, vector)
-        # T(k) changes by i R_a T(k), and so the quotient by what turns against the forces.
+        # dT(k)/dk_a = i R_a T(k), so the quotient changes by the work of rotated displacements.
         work = np.sum(u.conj() * forces.reshape(u.shape), axis=1)
         return np.asarray(2.0 * work.imag @ reduction.periodicity.shift)
 
@@ -139,7 +139,7 @@ class BlochWaves:
         return min((self.acoustic(best), best), turned, key=lambda pair: pair[0])
 
     def _solver_below(self, waves: FloatArray) -> tuple[CondensedWaves, float]:
-        """The inverses of K + s M, and s; from now on a larger s where that isn't enough."""
+        """The solvers with K + s M, and s, which is increased for good if not sufficient."""
         while True:
             solver = self._condensation.at(waves)
             if solver is not None:
@@ -153,9 +153,9 @@ class BlochWaves:
         self._condensation = Condensation(shifted, self.cell.reduction.boundary)
 
     def _start(self, dtype: Any, count: int, near: BlochModes | None) -> Batch:
-        """(size, count) vectors to begin with: those of ``near``, and always some noise.
+        """(size, count) start vectors: those of ``near``, plus noise in any case.
 
-        Eigenvectors of one wave vector may all lack the symmetry of a mode that comes down at
+        Eigenvectors of one wave vector may all lack the symmetry of a mode that becomes lowest at
         the next; without noise the iteration would never find it.
         """
         shape = 2, self.cell.reduction.size, count
@@ -182,7 +182,7 @@ def phases_of(points: Sequence[Wave]) -> FloatArray:
 
 
 def _groups(waves: FloatArray) -> list[NDArray[np.int64]]:
-    """Numbers of the waves that can be iterated together: Γ, other real ones, and some others."""
+    """Indices of waves that can be iterated together: Γ, other real ones, batches of the rest."""
     is_real, is_centre = _are_centre(2.0 * waves), _are_centre(waves)
     others = np.flatnonzero(~is_real)
     parts = np.array_split(others, math.ceil(len(others) / _BATCH) or 1)
@@ -203,12 +203,12 @@ _LARGEST_SPACE = 60  # in blocks
 def largest(
     solve: Operator, weigh: Operator, start: Batch, fixed: Batch, tolerance: float
 ) -> tuple[FloatArray, Batch]:
-    """The largest eigenvalues of A^-1 M, as many for each problem as ``start`` has vectors.
+    """The largest eigenvalues of A^-1 M, for each problem as many as ``start`` has vectors.
 
-    Every new block is made orthogonal to all others: there are few.
+    Every new block is orthogonalised against all others, of which there are few.
 
-    ``solve`` and ``weigh`` are A^-1 and M, both positive definite, applied to batches (size, w, m);
-    ``fixed`` (size, w, f) are M-orthonormal, and left out of the space; ``tolerance`` is about the
+    ``solve`` and ``weigh`` apply A^-1 and M, both positive definite, to batches (size, w, m);
+    ``fixed`` (size, w, f): M-orthonormal vectors excluded from the space; ``tolerance``: about the
     relative error of the eigenvalues. Returns values (w, m), descending, and M-orthonormal vectors.
     """
     count, width = start.shape[2], start.shape[1]
@@ -238,17 +238,17 @@ def largest(
 
 
 def _products(left: Batch, right: Batch) -> Batch:
-    """(w, i, j) left_i^H right_j."""
+    """(w, i, j) inner products left_i^H right_j."""
     return np.asarray(np.einsum("nwi,nwj->wij", left.conj(), right))
 
 
 def _mixed(vectors: Batch, factors: Batch) -> Batch:
-    """(size, w, j) sum of vectors_i factors_ij."""
+    """(size, w, j) linear combinations: sum of vectors_i factors_ij."""
     return np.asarray(np.einsum("nwi,wij->nwj", vectors, factors))
 
 
 def _orthonormal(block: Batch, weigh: Operator) -> tuple[Batch, Batch, Batch]:
-    """The block made M-orthonormal, its image by M, and R with block = orthonormal . R."""
+    """M-orthonormalise a block: orthonormal block, its image by M, R: block = orthonormal . R."""
     image = weigh(block)
     R = np.linalg.cholesky(_products(block, image)).conj().transpose(0, 2, 1)
     inverse = np.linalg.inv(R)

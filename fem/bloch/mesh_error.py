@@ -1,7 +1,7 @@
-"""How good a cell's mesh is: elements across its ligaments, and the error of a critical load.
+"""Quality of a cell's mesh: elements across its ligaments, and the error of a critical load.
 
-That error is estimated from the same point on a mesh refined once, every element divided into four
-along its own curved coordinates. Of the boundary, which stays as it is, nothing is learnt so.
+The error is estimated from the same critical point on a mesh refined once, with every element
+divided into four in its local coordinates. The error of the boundary's geometry is not included.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from modeharvest.fem.meshing import MeshBlock, join
 from modeharvest.util.arrays import FloatArray
 
 SMOOTH, NOTCHED = 2.0, 1.0
-"""Orders of convergence that critical loads have at least, by what the holes' edges are: between
-2.6 and 3.6 is seen for round holes (docs/explanation/bloch.md); notches make strains singular."""
-_NOTCH = 0.35  # rad: a kink that makes a notch
+"""Least orders of convergence of critical loads, for smooth and for notched edges of holes: 2.6 to
+3.6 is observed for round holes (docs/explanation/bloch.md); notches make strains singular."""
+_NOTCH = 0.35  # rad: a larger kink counts as a notch
 ENOUGH = 3
-"""Elements across a ligament."""
+"""Recommended least number of elements across a ligament."""
 
 
 def load_error(
     found: LatticeCritical, path: CellPath, material: Material, search: CriticalSearch
 ) -> tuple[float, float] | None:
-    """The critical load's error by one refinement [-], and the order p assumed.
+    """Estimated error of the critical load [-], from one refinement, and the assumed order p.
 
-    None where there is no such load, or the search is not to ``refine``. By Richardson's
-    extrapolation it is the change of the load times 2^p / (2^p - 1): what the load is too high by.
-    As p is assumed, at its lowest, that is a bound rather than a correction.
+    None without a critical load, or if the search isn't to ``refine``. By Richardson's
+    extrapolation the error is the change of the load times 2^p / (2^p - 1), by which the load is
+    too high. As p is assumed at its lowest, this is a bound rather than a correction.
     """
     if not (found.found and search.refine):
         return None
@@ -45,9 +45,9 @@ def load_error(
     shortest = float(np.linalg.norm(cell.lattice, axis=1).min())
     finer = UnitCell(refined(cell.mesh, 1e-7 * shortest), cell.lattice)
     nested = CellPath(PeriodicCell(finer, material), path.loading)
-    for load in np.arange(0.0, 0.88 * found.load, search.largest_step):  # jumps over no state
+    for load in np.arange(0.0, 0.88 * found.load, search.largest_step):  # by short steps
         nested.at(float(load))
-    # What is zero there falls almost in proportion to the load: three values show where.
+    # The critical eigenvalue is almost linear in the load: its zero follows from three values.
     loads, values, like = found.load * np.array([0.88, 0.93, 0.98]), [], found.least_stable
     for load in loads:
         if (state := nested.at(float(load))) is None:
@@ -61,7 +61,7 @@ def load_error(
 
 
 def refined(mesh: Mesh, tolerance: float) -> Mesh:
-    """A T6 mesh with every element divided into four; nodes nearer than that [mm] become one."""
+    """The T6 mesh with every element divided into four; merges nodes within tolerance [mm]."""
     blocks = []
     for corners in np.array(NODES)[PARTS]:
         places = np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])
@@ -74,10 +74,10 @@ def refined(mesh: Mesh, tolerance: float) -> Mesh:
 
 
 def elements_across(cell: UnitCell) -> tuple[int, FloatArray]:
-    """Fewest elements between two holes, copies included, and where [mm].
+    """Fewest elements between two holes, including copies, and their position [mm].
 
-    From each hole on layers of elements are counted; holes meet where a side joins two nodes that
-    are nearer to different ones. A hole's own arms, around a ligament that ends, are not looked at.
+    Layers of elements are counted from each hole; two holes meet where a side joins nodes that are
+    nearest to different holes. Ligaments between parts of the same hole are not considered.
     """
     p, edges = cell.periodicity, HoleEdges(cell.mesh, cell.periodicity)
     sides = np.concatenate([cell.mesh.cells[:, [k, (k + 1) % 3]] for k in range(3)])
@@ -101,7 +101,7 @@ def elements_across(cell: UnitCell) -> tuple[int, FloatArray]:
 
 
 def ligament_notes(cell: UnitCell) -> list[str]:
-    """A warning where there are few elements across a ligament."""
+    """A warning if there are too few elements across a ligament."""
     count, (x, y) = elements_across(cell)
     few = f"only {count} element{'s' * (count > 1)} across the ligament at ({x:.4g}, {y:.4g}) mm"
     return [] if count >= ENOUGH else [f"{few}: take {ENOUGH} or more, bending is too stiff so"]

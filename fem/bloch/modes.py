@@ -1,6 +1,6 @@
 """Modes and branches of a lattice as plain numpy, and their files (HDF5, VTU, XDMF).
 
-Neither dolfinx nor gmsh is needed to read or use these. HDF5, to be read with h5py alone;
+Neither dolfinx nor gmsh is needed to read or use them. The HDF5 file, readable with h5py alone, for
 m modes on a cell of n nodes::
 
     @format "modeharvest-modes-1"   @element "T6"   @normalisation (a sentence)
@@ -16,8 +16,8 @@ m modes on a cell of n nodes::
                               amplitudes (m,) [mm]      @load @energy @primary_energy [MPa]
                               @negative_eigenvalues
 
-VTU and XDMF (one file each) have the same fields as point data, named by meaning and unit, and the
-rest as JSON in a comment at the top.
+VTU and XDMF (one file each) have the same fields as point data, named by meaning and unit; all
+other values are JSON in a comment at the top.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ NORMALISATION = "the mean over the cell's material of phi_i . phi_j is 1 for i =
 
 @dataclass(frozen=True, eq=False)
 class ModeSet:
-    """Real modes of a lattice on its smallest cell that has their period."""
+    """Real modes of a lattice on the smallest cell that has their period."""
 
     mesh: Mesh
     """T6 mesh of the commensurate cell, undeformed [mm]."""
@@ -60,18 +60,18 @@ class ModeSet:
     waves: tuple[Wave, ...]
     """(m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad]."""
     eigenvalues: FloatArray
-    """(m,) of K x = lambda M x, M of unit density [N/mm^4]; near 0 at a critical point."""
+    """(m,) eigenvalues of K x = lambda M x, M of unit density [N/mm^4]; ~0 at a critical point."""
     shapes: FloatArray
     """(m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
     delta_ij. The sign is such that the first large component is positive. Waves with phases other
-    than 0 and pi have their modes in pairs, which are the real and imaginary part."""
+    than 0 and pi have pairs of modes, the real and the imaginary part."""
     load: float
     gradient: FloatArray
     """Load parameter and F̄ (2, 2) of the state whose tangent the modes belong to [-]."""
     info: Mapping[str, Any] = field(default_factory=dict)
     """Plain JSON values: lattice, material, loading, where it is critical, versions."""
     origin: IntArray | None = None
-    """(n,) ``UnitCell.origin`` of each node, that of the node that it is a copy of."""
+    """(n,) ``UnitCell.origin`` of the node that each node is a copy of."""
 
     def __post_init__(self) -> None:
         count = len(self.waves)
@@ -94,13 +94,13 @@ class BranchState:
     """(2, 2) F̄ [-] and P̄ [MPa]."""
     energy: float
     primary_energy: float
-    """Stored energy per area of the cell, here and on the primary path at the same load [MPa]; NaN
-    where that path ends before. Under a stress other than 0 the lower energy minus P̄ : F̄ is what
-    is preferred."""
+    """Stored energy per area of the cell, on the branch and on the primary path at the same load
+    [MPa]; NaN if the latter ends before. Under a nonzero stress, the path with the lower energy
+    minus P̄ : F̄ is preferred."""
     negative_eigenvalues: int
-    """Of the cell's tangent with F̄'s free components; 0: stable in its period."""
+    """Number for the cell's tangent with F̄'s free components; 0: stable in the cell's period."""
     displacement: FloatArray
-    """(n, 2) of the mesh's nodes [mm]."""
+    """(n, 2) displacement of the mesh's nodes [mm]."""
     amplitudes: FloatArray
     """(m,) mean of (u - affine part - primary fluctuation) . phi_i over material [mm]."""
 
@@ -111,16 +111,16 @@ class BranchState:
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """A buckled branch: which combination of modes it started with, and its states."""
+    """A buckled branch: its initial combination of modes, and its states."""
 
     combination: tuple[float, ...]
     """(m,) coefficients of the modes at the start, of unit length [-]."""
     states: tuple[BranchState, ...]
-    """By load; empty if it could not be followed. A load met twice is there twice."""
+    """States by load; empty if it could not be followed. A load met twice appears twice."""
     outcome: str
     """How far it was followed, and why no farther."""
     curve: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    """(p, 2) amplitude of the combination [mm] and load [-] of all points from the first."""
+    """(p, 2) amplitude of the combination [mm] and load [-] at all points of the branch."""
 
 
 FORMAT = "modeharvest-modes-1"
@@ -128,7 +128,7 @@ _OF_SET = ("lattice", "primitive", "eigenvalues", "gradient")
 
 
 def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
-    """Write HDF5, atomically and without loss; the layout is in the module's docstring."""
+    """Write HDF5, atomically and losslessly; the module's docstring describes the layout."""
     with atomic_hdf5(path) as file:
         file.attrs["format"] = FORMAT
         file.attrs["normalisation"] = NORMALISATION
@@ -151,7 +151,7 @@ def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = (
 
 
 def read_modes(path: Path | str) -> tuple[ModeSet, tuple[Branch, ...]]:
-    """Read what :func:`write_modes` wrote; an InputError refuses any other file."""
+    """Read a file of :func:`write_modes`; InputError for any other file."""
     with open_hdf5(path, "modes (HDF5)", "make it again with 'modeharvest modes'", FORMAT) as file:
         modes = ModeSet(
             mesh=read_mesh(file),
@@ -172,7 +172,7 @@ def write_vtu(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ())
 
 
 def write_xdmf(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
-    """Write modes and branches as XDMF with all numbers in the one file, atomically."""
+    """Write modes and branches as XDMF, atomically, with all numbers in one file."""
     _write_meshio(path, modes, branches, "xdmf", data_format="XML")
 
 
@@ -196,7 +196,7 @@ def _write_meshio(
 
 
 def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
-    """Nodal vectors by names with their meaning and unit."""
+    """Nodal vectors by names that state meaning and unit."""
     named: dict[str, Any] = {} if modes.origin is None else {"node_in_file": modes.origin}
     for k, (wave, shape) in enumerate(zip(modes.waves, modes.shapes, strict=True), start=1):
         phases = "_".join(f"{phase / np.pi:.4g}pi" for phase in wave)
@@ -210,7 +210,7 @@ def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
 
 
 def _described(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
-    """All that isn't a nodal field, as plain JSON values."""
+    """Everything except nodal fields, as plain JSON values."""
     outcomes = [{"combination": list(b.combination), "outcome": b.outcome} for b in branches]
     return {
         "format": FORMAT,
@@ -229,7 +229,7 @@ def _described(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
 def _comment(path: Path, content: dict[str, Any]) -> None:
     """Put JSON into a comment before the first element of an XML file."""
     text = path.read_text("utf-8")
-    # Comments may not contain two hyphens; within JSON's strings they can be written otherwise.
+    # Comments must not contain two hyphens; in JSON strings they can be escaped.
     words = json.dumps(content).replace("--", "-\\u002d")
     start = text.index("?>") + 2 if text.startswith("<?xml") else 0
     path.write_text(f"{text[:start]}\n<!-- {words} -->{text[start:]}".lstrip(), "utf-8")

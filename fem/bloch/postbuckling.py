@@ -1,9 +1,9 @@
 """The buckled branches of a periodic cell, from the critical load on.
 
 A branch starts along a combination of the critical modes. Its amplitude is prescribed and the
-load is an unknown, which is regular where the branch leaves the primary path and where its load
-has a maximum or minimum; so branches along which the load falls are followed as well. The states
-at given loads are then met exactly. A branch ends at contact, which isn't modelled.
+load is an unknown. This is regular where the branch leaves the primary path and where its load has
+a maximum or minimum, so that branches with falling load can be followed. The states at given loads
+are then computed exactly. A branch ends at contact, which isn't modelled.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
-# Shares of the primitive cell's shorter vector: first and largest step of the amplitude, the rms
-# displacement in the mode, and where to stop. At small amplitudes the directions of a degenerate
-# set are all but equivalent.
+# First and largest step of the amplitude (the rms displacement in the mode), and where to stop, all
+# over the primitive cell's shorter vector. At small amplitudes the directions of a degenerate set
+# are almost equivalent.
 _FIRST, _LONGEST, _FARTHEST = 0.01, 0.02, 0.4
-_GROWTH = 1.6  # of the step from one point to the next
-_BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
-# Of the load: how far off a mode's own critical load may be, where a mesh splits a set (from 10 %
-# off the same branches are found, docs/explanation/modes.md), and a splitting that isn't rounding.
+_GROWTH = 1.6  # largest growth factor of the step from one point to the next
+_BEFORE = 1e-4  # of the critical load: distance where the primary path is regular enough
+# Of the load: largest distance of a mode's critical load, if a mesh splits a set (even at 10 % the
+# same branches are found, docs/explanation/modes.md); least splitting that isn't rounding.
 _CRITICAL, _SPLIT = 3e-2, 1e-5
-_NEAR = 0.5  # of a step: how far from where it is expected a point may be
+_NEAR = 0.5  # largest distance of a point from its prediction, over the step
 _REFINEMENTS = 6
 
 
@@ -45,15 +45,15 @@ def follow(
 ) -> Branch:
     """Follow the branch that starts along a combination of critical modes.
 
-    Only the amplitude of the combination is prescribed; all else, other modes included, is free to
-    follow, and ``BranchState.amplitudes`` have the result. An InputError refuses another cell than
-    that of the modes, and a combination that doesn't fit them. A branch that can't be followed is
-    an outcome, not an exception.
+    Only the amplitude of the combination is prescribed; everything else, including other modes, is
+    free, and ``BranchState.amplitudes`` has the result. InputError if the cell isn't that of the
+    modes, or the combination doesn't fit them. A branch that can't be followed is reported in
+    ``Branch.outcome``, not as an exception.
 
     path, modes : primary path of the commensurate cell, that of ``modes.mesh``, such as
         ``CellPath(PeriodicCell(cell.enlarged(2, 2), material), loading)``; its critical modes.
-    combination : (m,) coefficients; only ratios and signs count. The opposite is the other half.
-    loads : at which to report states [-]. One that the branch meets twice is reported twice.
+    combination : (m,) coefficients; only ratios and signs matter. The opposite: the other half.
+    loads : loads at which to report states [-]. A load met twice is reported twice.
     """
     _check(path.cell, modes, combination, loads)
     mix = np.asarray(combination, dtype=np.float64)
@@ -62,7 +62,7 @@ def follow(
 
 
 class _Tracing:
-    """One branch of one cell; ``points`` are those passed, ``stopped`` is why there are no more."""
+    """Follows a branch of a cell; ``points``: computed so far; ``stopped``: why no more."""
 
     def __init__(self, path: CellPath, modes: ModeSet, mix: FloatArray) -> None:
         self.cell, self.loading = path.cell, path.loading
@@ -70,7 +70,7 @@ class _Tracing:
         self.pitch = float(np.linalg.norm(modes.primitive, axis=1).min())
         reduction, mass = self.cell.reduction, self.cell.nodal_mass
         shapes, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
-        # (m, size): times the fluctuation they are the amplitudes of the modes.
+        # (m, size): their products with the fluctuation are the amplitudes of the modes.
         self.weights = reduction.restricted(np.asarray(mass @ shapes.T)).T / material
         self.mass = self.cell.mass(CENTRE) / material
         below = path.at((1.0 - _BEFORE) * modes.load)
@@ -79,7 +79,7 @@ class _Tracing:
         self.stopped = ""
 
     def run(self, loads: list[float], progress: Progress) -> Branch:
-        """Follow the branch, and report the requested loads."""
+        """Follow the branch, and report states at the requested loads."""
         states: list[BranchState] = []
         for _ in self._follow():
             here, there = self.points[-2:]
@@ -116,7 +116,7 @@ class _Tracing:
         return text + (f"; not met: {missing}" if missing else "")
 
     def _follow(self) -> Iterator[None]:
-        """Add to ``points`` by growing amplitude, pausing after each but the critical one."""
+        """Extend ``points`` by growing amplitude; yield after each except the critical point."""
         start = self._start()
         if start is None:
             return
@@ -130,7 +130,7 @@ class _Tracing:
                     self.stopped = found
                     return
                 continue
-            if len(self.points) == 1:  # the direction in which the branch leaves
+            if len(self.points) == 1:  # determines the initial direction of the branch
                 mix = self.weights @ (found.value[4:] - self.origin)
                 rate = self._direction(mix) * (1.0 / found.amplitude)
                 self.points[0] = replace(start, rate=rate)
@@ -140,7 +140,7 @@ class _Tracing:
         self.stopped = f"the largest amplitude asked for is {_FARTHEST} of the pitch"
 
     def _start(self) -> BranchPoint | None:
-        """The critical point, extrapolated from where the tangent is regular, and the mode."""
+        """The critical point, extrapolated from a state with a regular tangent, and the mode."""
         load = self.modes.load
         if not self.primary.states:
             self.stopped = f"no equilibrium of the primary path near the load {load:.6g}"
@@ -159,14 +159,14 @@ class _Tracing:
         return BranchPoint(0.0, load, 0.0, value, self._direction(self.mix))
 
     def _direction(self, mix: FloatArray) -> FloatArray:
-        """(4 + size,) a combination of the modes, F̄ fixed; one master is fixed by a translation."""
+        """(4 + size,) a combination of modes at fixed F̄, translated so that a master is fixed."""
         periodicity, order = self.cell.reduction.periodicity, self.cell.reduction.order
         at_masters = np.empty((periodicity.count, 2))
         at_masters[periodicity.master] = np.tensordot(mix, self.modes.shapes, 1)
         return np.concatenate([np.zeros(4), (at_masters - at_masters[0]).ravel()[order]])
 
     def _at_amplitude(self, points: Sequence[BranchPoint], amplitude: float) -> BranchPoint | str:
-        """The point of the branch at an amplitude, from one or two before it; or why not."""
+        """The branch's point at an amplitude, from one or two previous points; or why not."""
         weights, guess = self.mix @ self.weights, value_at(points, amplitude)
         prescribed = Amplitude(weights, amplitude + float(weights @ self.origin))
         load = load_at(points, amplitude)
@@ -182,7 +182,7 @@ class _Tracing:
         return BranchPoint(amplitude, found.load, 1.0 / rate, found.value, found.rate / rate)
 
     def _at_load(self, here: BranchPoint, there: BranchPoint, load: float) -> CellState | None:
-        """The state between two points at a load, which one of them is below and one above."""
+        """The state at a load between the loads of two points; None if not found."""
         for _ in range(_REFINEMENTS):
             between = (here, there)
             amplitude = amplitude_at(between, load, here.amplitude, there.amplitude)
@@ -205,7 +205,7 @@ class _Tracing:
         return overlaps(cell.mesh, cell.lattice, state.gradient, self.cell.displacement(state))
 
     def _report(self, state: CellState) -> BranchState:
-        """The state as plain numpy, beside the primary path at the same load."""
+        """The state as plain numpy, with the energy of the primary path at the same load."""
         cell, primary = self.cell, self.primary.at(state.load)
         u, before, on_path = cell.displacement(state), self.origin, math.nan
         if primary is not None:

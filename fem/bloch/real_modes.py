@@ -1,8 +1,8 @@
 """Real buckling modes of a lattice, on the smallest cell that has their period.
 
-A Bloch eigenvector x of the primitive cell continues as u(X + R) = exp(i k . R) u(X). Where the
+A Bloch eigenvector x of the primitive cell continues as u(X + R) = exp(i k . R) u(X). If the
 phases of k are 2 pi times fractions, it repeats after m x n cells. If all phases are multiples
-of pi, u is real; otherwise its real and imaginary part are two modes, of the waves k and -k.
+of pi, u is real; otherwise its real and imaginary parts are two modes, of the waves k and -k.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 Turns = tuple[Fraction, Fraction]
-Shifts = Sequence[tuple[int, int]]  # of copies, along a1 and a2
+Shifts = Sequence[tuple[int, int]]  # shifts of copies along a1 and a2
 
-_SNAP = 1e-3  # rad: how near to a fraction a wave found by descent is
-_DEGENERATE = 1e-6  # of the eigenvalues' scale: values that far apart belong to one set
-_MULTIPLICITY = 6  # the most modes of one wave that are looked for
-_TOLERANCE = 1e-18  # of an eigenvalue; of a mode it is the root of this
-_LARGE = 0.9  # of the largest component: the first such fixes the phase
+_SNAP = 1e-3  # rad: largest distance from a fraction of a wave found by descent
+_DEGENERATE = 1e-6  # of the eigenvalues' scale: closer eigenvalues are degenerate
+_MULTIPLICITY = 6  # largest number of modes searched for at one wave
+_TOLERANCE = 1e-18  # of an eigenvalue; that of a mode is the root of this
+_LARGE = 0.9  # of the largest component: the first component above it fixes the phase
 
 
 def real_modes(
@@ -44,15 +44,15 @@ def real_modes(
     info: Mapping[str, Any] | None = None,
     largest: int = 12,
 ) -> ModeSet:
-    """The lowest modes at some waves as real fields on their smallest common m x n cell.
+    """The lowest modes at given waves as real fields on their smallest common m x n cell.
 
     A wave with phases 0 or pi gives one mode (or all of a degenerate eigenvalue), any other twice
-    as many. Waves within a thousandth of a rad of a fraction are taken for it; a wave given twice,
-    or as k and -k, counts once. An InputError refuses no wave at all (long ones are modes of no
-    finite cell), and one that doesn't repeat within ``largest`` cells.
+    as many. Phases within 1e-3 rad of a fraction are rounded to it; a wave given twice, or as k and
+    -k, counts once. InputError without waves (long waves are modes of no finite cell), and for a
+    wave that doesn't repeat within ``largest`` cells.
 
-    cell, state, waves : primitive; its equilibrium and phases [rad], such as of a critical point.
-    info, largest : plain JSON values to be kept with the modes; the most copies along a1 or a2.
+    cell, state, waves : primitive cell; equilibrium and phases [rad], such as of a critical point.
+    info, largest : plain JSON values to store with the modes; most copies along a1 or a2.
     """
     turns: list[Turns] = []
     for turn in (_commensurate(wave, largest) for wave in waves):
@@ -112,7 +112,7 @@ def _phases(turns: Turns) -> Wave:
 
 
 def _lowest_set(degeneracy: Degeneracy, wave: Wave) -> BlochModes:
-    """The lowest eigenvalue at one wave with all eigenvectors that symmetry adds to the first."""
+    """The lowest eigenvalues at one wave, with all eigenvectors degenerate by symmetry."""
     bloch, cell = degeneracy.bloch, degeneracy.cell
     found = bloch.lowest(wave, _MULTIPLICITY, tolerance=_TOLERANCE)
     values = found.eigenvalues
@@ -122,10 +122,10 @@ def _lowest_set(degeneracy: Degeneracy, wave: Wave) -> BlochModes:
 
 
 def canonical(vectors: NDArray[Any]) -> NDArray[Any]:
-    """The basis of a space (size, m) that depends on nothing but the space.
+    """A canonical basis of the space of vectors (size, m), which depends only on the space.
 
     The first vector has the largest possible value, real and positive, at the first component
-    that is large; the others are 0 there and go on likewise.
+    that is large; the others are 0 there and are chosen in the same way.
     """
     sizes = np.linalg.norm(vectors, axis=1)
     row = vectors[int(np.argmax(sizes > _LARGE * sizes.max()))]
@@ -137,14 +137,14 @@ def canonical(vectors: NDArray[Any]) -> NDArray[Any]:
 
 
 def _copies(cell: UnitCell, enlarged: UnitCell, shifts: Shifts) -> NDArray[np.int64]:
-    """(m n, nodes) numbers in the enlarged mesh of the nodes of each copy of the cell."""
+    """(m n, nodes) node numbers in the enlarged mesh of each copy of the cell."""
     tree = cKDTree(enlarged.mesh.nodes)
     moved = [cell.mesh.nodes + np.array(shift) @ cell.lattice for shift in shifts]
     return np.stack([tree.query(nodes)[1] for nodes in moved])
 
 
 def _origin(cell: UnitCell, places: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """``UnitCell.origin`` on the enlarged mesh; of nodes that two copies share the first one's."""
+    """``UnitCell.origin`` on the enlarged mesh; for nodes shared by two copies, of the first."""
     if cell.origin is None:
         return None
     origin = np.empty(places.max() + 1, dtype=np.int64)
@@ -156,7 +156,7 @@ def _origin(cell: UnitCell, places: NDArray[np.int64]) -> NDArray[np.int64] | No
 def _real_fields(
     cell: PeriodicCell, modes: BlochModes, shifts: Shifts, places: NDArray[np.int64]
 ) -> FloatArray:
-    """(c, n, 2) orthonormal real fields on the enlarged cell that the Bloch vectors amount to."""
+    """(c, n, 2) orthonormal real fields of the Bloch vectors on the enlarged cell."""
     material = cell.filling * cell.cell.area
     phases = np.exp(1j * (np.array(shifts) @ np.asarray(modes.wave)))
     displaced = (cell.reduction.displacement(x, modes.wave) for x in modes.vectors.T)

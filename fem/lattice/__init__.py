@@ -1,1 +1,1 @@
-"""Infinite lattices by one periodic cell: meshes, periodicity, macroscopic loading, equilibrium."""
+"""Infinite lattices as one periodic cell: mesh, periodicity, macroscopic loading, equilibrium."""

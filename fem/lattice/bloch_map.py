@@ -1,12 +1,12 @@
 """The Bloch map T(k) and matrices T(k)^H K T(k): a lattice reduced to one cell, for any wave.
 
-At a node that lies R1 a1 + R2 a2 from its master, u = exp(i (R1 k1 + R2 k2)) times the master's,
-with the phases k1 = k . a1 and k2 = k . a2. An entry of K between nodes of shifts R and R' is thus
-multiplied by exp(i k . (R' - R)). Sorted by R' - R once, the reduced matrix for any k is a sum of a
-few arrays over one sparsity pattern.
+At a node at R1 a1 + R2 a2 from its master, u is exp(i (R1 k1 + R2 k2)) times the master's u, with
+the phases k1 = k . a1 and k2 = k . a2. An entry of K between nodes with shifts R and R' is thus
+multiplied by exp(i k . (R' - R)). The entries are sorted by R' - R once; the reduced matrix for any
+k is then a sum of a few arrays over one sparsity pattern.
 
-Only nodes with copies in other cells feel the phase. So the others are eliminated once
-(:class:`Condensation`), and only the small dense (Schur) complement on the cell's boundary is
+Only nodes with copies in other cells depend on the phase. So the others are eliminated once
+(:class:`Condensation`), and only the small dense Schur complement on the cell's boundary is
 reduced by T(k) and factorised for each wave vector. The matrix for a wave has as many negative
 eigenvalues as its interior and its complement together (Haynsworth, Linear Algebra Appl. 1 (1968)
 73-81). A batch of vectors is an array (size, w, m), m vectors for each of w wave vectors.
@@ -33,42 +33,42 @@ Batch = NDArray[Any]  # of real or complex numbers
 
 
 class BlochMap:
-    """Components of displacement that are copies of others, some in other cells.
+    """Components of displacement that are copies of unknowns, some in other cells.
 
-    ``places`` (n,) say which unknown, 0 ... size - 1, each component follows, and ``shift`` (n, 2),
-    integers R, that it lies R1 a1 + R2 a2 from there.
+    ``places`` (n,): unknown, 0 ... size - 1, that each component follows; ``shift`` (n, 2):
+    integers R such that the component is at R1 a1 + R2 a2 from the unknown.
     """
 
     def __init__(self, places: IntArray, shift: IntArray) -> None:
         self.places, self.shift = places, shift
         self._turned = np.flatnonzero(np.any(shift != 0, axis=1))
-        # The first copies of all unknowns, the second copies of those that have one, ...
+        # First copies of all unknowns, then the second copies of unknowns that have them, ...
         order = np.argsort(places, kind="stable")
         first = np.searchsorted(places[order], np.arange(places.max() + 1))
         rank = np.arange(len(places)) - first[places[order]]
         self._ranks = [order[rank == k] for k in range(int(rank.max()) + 1)]
 
     def at(self, waves: FloatArray) -> BlochTransform:
-        """T(k) for wave vectors given as phases (w, 2) [rad]; real if all its entries are."""
+        """T(k) for wave vectors given as phases (w, 2) [rad]; real if all entries are real."""
         return BlochTransform(self, phase_factors(self.shift[self._turned], waves))
 
 
 class BlochTransform:
-    """T(k) for some wave vectors; made by ``BlochMap.at``."""
+    """T(k) for several wave vectors, made by ``BlochMap.at``."""
 
     def __init__(self, bloch_map: BlochMap, factors: Batch) -> None:
         self.dtype = factors.dtype
         self._map, self._factors = bloch_map, factors[:, :, None]
 
     def expand(self, vectors: Batch) -> Batch:
-        """T x for x (size, w, m)."""
+        """T x (n, w, m) for x (size, w, m)."""
         bloch_map = self._map
         result = vectors[bloch_map.places].astype(np.result_type(vectors, self.dtype), copy=False)
         result[bloch_map._turned] *= self._factors
         return np.asarray(result)
 
     def restrict(self, forces: Batch) -> Batch:
-        """T^H f for f (n, w, m), which is overwritten."""
+        """T^H f (size, w, m) for f (n, w, m), which is overwritten."""
         bloch_map = self._map
         forces[bloch_map._turned] *= self._factors.conj()
         first, *others = bloch_map._ranks
@@ -86,16 +86,16 @@ def phase_factors(shift: IntArray, waves: FloatArray) -> Batch:
 
 
 def applied(operator: Callable[[FloatArray], FloatArray], vectors: Batch) -> Batch:
-    """A real linear operator (n, c) -> (n', c) applied to a batch (n, w, m), complex or not."""
+    """Apply a real linear operator (n, c) -> (n', c) to a real or complex batch (n, w, m)."""
     kind, flat = vectors.dtype, np.ascontiguousarray(vectors).reshape(len(vectors), -1)
     result = np.ascontiguousarray(operator(flat.view(np.float64))).view(kind)
     return result.reshape(len(result), *vectors.shape[1:])
 
 
 class ShiftedEntries:
-    """The entries of unreduced matrices summed by their place in T^H A T and by R' - R.
+    """Sums the entries of unreduced matrices by their place in T^H A T and by R' - R.
 
-    ``differences`` (e, 2) are R' - R of the unreduced entries, ``entries`` (e,) their numbers among
+    ``differences`` (e, 2) are R' - R of the unreduced entries, ``entries`` (e,) their indices among
     the ``count`` entries of the reduced matrix.
     """
 
@@ -105,32 +105,32 @@ class ShiftedEntries:
         self._target = phase.ravel() * count + entries.ravel()
 
     def summed(self, values: FloatArray) -> FloatArray:
-        """(d, count) blocks of the entries (e,): one for each R' - R."""
+        """(d, count) sums of the entries (e,), one row for each of d distinct R' - R."""
         size = self._shape[0] * self._shape[1]
         return np.asarray(np.bincount(self._target, values, size), np.float64).reshape(self._shape)
 
     def at(self, blocks: FloatArray, waves: FloatArray) -> Batch:
-        """(w, count) entries of T^H A T for phases (w, 2) [rad]; real where T is."""
+        """(w, count) entries of T^H A T for phases (w, 2) [rad]; real if T is."""
         factors = phase_factors(self._differences, waves).T
         if factors.dtype.kind == "f":
             return np.asarray(factors @ blocks)
         result = np.empty((len(factors), blocks.shape[1]), dtype=np.complex128)
-        # Without a complex copy of the blocks.
+        # Avoids a complex copy of the blocks.
         result.real, result.imag = factors.real @ blocks, factors.imag @ blocks
         return result
 
 
 class BoundaryDofs:
-    """The components of displacement with copies in other cells, and how their matrices reduce.
+    """The displacement components with copies in other cells, and the reduction of their matrices.
 
     ``interior`` and ``boundary`` are the components without and with copies, ``interior_places``
-    and ``boundary_places`` the reduced unknowns that they are; ``bloch_map`` is the boundary's.
+    and ``boundary_places`` the corresponding reduced unknowns; ``bloch_map``: of the boundary.
     """
 
     def __init__(self, bloch_map: BlochMap) -> None:
         is_interior = np.bincount(bloch_map.places)[bloch_map.places] == 1
         interior = np.flatnonzero(is_interior)
-        self.interior = interior[np.argsort(bloch_map.places[interior])]  # with little fill-in
+        self.interior = interior[np.argsort(bloch_map.places[interior])]  # for little fill-in
         self.interior_places = bloch_map.places[self.interior]
         self.boundary = np.flatnonzero(~is_interior)
         places = bloch_map.places[self.boundary]
@@ -143,20 +143,20 @@ class BoundaryDofs:
         self._entries = ShiftedEntries(differences, entries, self._size**2)
 
     def sorted(self, matrix: FloatArray) -> FloatArray:
-        """The entries of a dense matrix of all boundary components by their phase."""
+        """The entries of a dense matrix over all boundary components, summed by phase."""
         return self._entries.summed(matrix.ravel())
 
     def reduced(self, blocks: FloatArray, waves: FloatArray) -> Batch:
-        """(w, m, m) T^H A T of a sorted matrix A for phases (w, 2) [rad]."""
+        """(w, m, m) T^H A T of a matrix A, given as by :meth:`sorted`, for phases (w, 2) [rad]."""
         return self._entries.at(blocks, waves).reshape(-1, self._size, self._size)
 
 
 class Reduction:
-    """The pattern of reduced matrices; the same for every matrix of one mesh.
+    """The sparsity pattern of reduced matrices, the same for every matrix of one mesh.
 
     Reduced unknowns are the masters' displacements, permuted so that factors have little
     fill-in: ``order[j]`` is the component (2 * master + axis) at place j. ``pattern`` (2 n, 2 n) is
-    any matrix with the mesh's sparsity, the two components of a node side by side.
+    any matrix with the mesh's sparsity and with the two components of a node adjacent.
     """
 
     def __init__(self, pattern: csr_array, periodicity: Periodicity) -> None:
@@ -165,7 +165,7 @@ class Reduction:
         self.order: IntArray = np.arange(self.size)
         self._sort(pattern)
         whole = self.assembled(self._entries.summed(pattern.data).sum(axis=0))
-        # Shifted, so that it is regular; all that counts is where its entries are.
+        # Shifted to be regular; only the positions of its entries matter.
         identity = csc_array((np.ones(self.size), (self.order, self.order)))
         shift = 2.0 * float(abs(whole).sum(axis=0).max())
         regular = factorise(whole + shift * identity, "MMD_AT_PLUS_A")
@@ -173,9 +173,9 @@ class Reduction:
         self._sort(pattern)
 
     def _sort(self, pattern: csr_array) -> None:
-        """Find where every entry of an unreduced matrix goes, and with which phase.
+        """Find the place and the phase of every entry of an unreduced matrix.
 
-        ``bloch_map`` has the components of the mesh's nodes as copies of the reduced unknowns.
+        ``bloch_map`` describes the components of all nodes as copies of the reduced unknowns.
         """
         components = (2 * self.periodicity.master[:, None] + np.arange(2)).ravel()
         places = np.argsort(self.order)[components]
@@ -191,20 +191,20 @@ class Reduction:
         self._entries = ShiftedEntries(shift[columns] - shift[rows], entry, len(entries))
 
     def reduced(self, matrix: csr_array) -> Callable[[Wave], csc_array]:
-        """T(k)^H K T(k), Hermitian, as a function of the phases [rad], real at multiples of pi.
+        """T(k)^H K T(k), Hermitian, as a function of the phases [rad]; real at multiples of pi.
 
-        K is of the pattern that this was made for.
+        K must have the pattern given to the constructor.
         """
         blocks = self._entries.summed(matrix.data)
         return lambda wave: self.assembled(self._entries.at(blocks, np.array([wave]))[0])
 
     def assembled(self, data: NDArray[Any]) -> csc_array:
-        """The sparse matrix with these entries."""
+        """The sparse reduced matrix with these entries."""
         return csc_array((data, self._indices, self._indptr), shape=(self.size, self.size))
 
     @cached_property
     def boundary(self) -> BoundaryDofs:
-        """Those components that have copies in other cells."""
+        """The components that have copies in other cells."""
         return BoundaryDofs(self.bloch_map)
 
     def displacement(self, vector: NDArray[Any], wave: Wave = CENTRE) -> NDArray[Any]:
@@ -219,14 +219,14 @@ class Reduction:
 
 
 def factorise(matrix: csc_array, order: str = "NATURAL") -> Any:
-    """SuperLU factor of a Hermitian matrix with pivots on the diagonal: L D L^H in fact."""
+    """SuperLU factor of a Hermitian matrix with diagonal pivots, in effect L D L^H."""
     options = {"SymmetricMode": True, "Equil": False}
-    # Small supernodes suit matrices of some thousand rows.
+    # Small supernodes are fastest for matrices of some thousand rows.
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=1, options=options)
 
 
 class Condensation:
-    """A symmetric matrix (2 n, 2 n) of a mesh's nodes, condensed onto those that have copies."""
+    """A symmetric matrix (2 n, 2 n) of a mesh's nodes, condensed onto nodes with copies."""
 
     def __init__(self, matrix: csr_array, dofs: BoundaryDofs) -> None:
         self.dofs = dofs
@@ -240,11 +240,11 @@ class Condensation:
         self._blocks = dofs.sorted(corner - self.transposed @ self.response)
 
     def at(self, waves: FloatArray) -> CondensedWaves | None:
-        """The solvers for phases (w, 2) [rad]; None if one matrix isn't positive definite."""
+        """The solvers for phases (w, 2) [rad]; None if any matrix isn't positive definite."""
         if not self.is_definite:
             return None
         try:
-            # LAPACK has matrices by columns, and A(-k)^T = A(k).
+            # LAPACK stores matrices by columns, and A(-k)^T = A(k).
             transposed = self.dofs.reduced(self._blocks, -waves)
             return CondensedWaves(self, transposed.transpose(0, 2, 1), waves)
         except np.linalg.LinAlgError:
@@ -252,7 +252,7 @@ class Condensation:
 
 
 class CondensedWaves:
-    """The inverses of T(k)^H A T(k), in the order of the reduced unknowns."""
+    """Solvers with T(k)^H A T(k), in the order of the reduced unknowns."""
 
     def __init__(self, whole: Condensation, complements: Batch, waves: FloatArray) -> None:
         self._whole = whole

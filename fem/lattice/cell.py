@@ -1,11 +1,11 @@
 """A periodic cell under macroscopic loading: equilibrium, effective stiffness, path.
 
-The displacement is u = (F̄ - I) X + w with a periodic fluctuation w. Unknown are the masters'
-fluctuations and those components of F̄ whose mean stress is prescribed; one master is fixed,
-because translations cost nothing. The fluctuation is condensed with one factor of its stiffness.
-What remains are the free components of F̄ and, if an amplitude is prescribed, the load: a small
-dense system, which gives the lattice's effective tangent moduli as a by-product. With an amplitude
-prescribed it is regular on a branch however near to the point where it leaves the primary path.
+The displacement is u = (F̄ - I) X + w with a periodic fluctuation w. Unknowns are the masters'
+fluctuations and the components of F̄ whose mean stress is prescribed; one master is fixed to
+exclude translations. The fluctuation is condensed with one factor of its stiffness. This leaves the
+free components of F̄ and, if an amplitude is prescribed, the load: a small dense system, which also
+gives the lattice's effective tangent moduli. With a prescribed amplitude it is regular on a branch
+even close to the point where the branch leaves the primary path.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from modeharvest.fem.materials import Material
 from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.util.arrays import FloatArray
 
-# Forces must be smaller than what a change of the load by this would make.
+# Unbalanced forces must be smaller than those of a change of the load by this.
 _LOAD_TOLERANCE = 1e-11
 _AMPLITUDE_TOLERANCE = 1e-11  # relative
 _ITERATIONS = 12
 _SMALLEST_STEP = 1e-6  # of the load
-_BACK = 1e-4  # of the load: to where the rate of an eigenvalue is taken
+_BACK = 1e-4  # of the load: backward step for the rate of an eigenvalue
 _NOT_CONVERGED = "Newton's method did not converge"
 _REVERSED = "an element would be turned inside out (det F <= 0)"
 
@@ -38,17 +38,17 @@ class CellState:
     """An equilibrium of a cell."""
 
     load: float
-    """e; for compressions the nominal strain [-]."""
+    """Load e; for compressions the nominal strain [-]."""
     gradient: FloatArray
     """(2, 2) F̄ [-]."""
     fluctuation: FloatArray
-    """(2 count,) w of the masters as in ``Reduction`` [mm]."""
+    """(2 count,) w of the masters, in the order of ``Reduction`` [mm]."""
     rate: FloatArray
-    """(4 + 2 count,) derivatives of both by the load."""
+    """(4 + 2 count,) derivatives of F̄ and w by the load."""
     stress: FloatArray
-    """(2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa]."""
+    """(2, 2) P̄, mean first Piola-Kirchhoff stress over the cell including holes [MPa]."""
     stiffness: csr_array
-    """(2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2]."""
+    """(2 n, 2 n) tangent stiffness of the mesh's nodes without constraints [N/mm^2]."""
     moduli: FloatArray
     """(2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa]."""
 
@@ -60,25 +60,25 @@ class CellState:
 
 @dataclass(frozen=True, eq=False)
 class Amplitude:
-    """``weights . w = value`` is prescribed, while the load is found."""
+    """A prescribed amplitude, ``weights . w = value``, instead of a prescribed load."""
 
     weights: FloatArray
-    """(2 count,) in the order of ``Reduction``, and not those of a translation."""
+    """(2 count,) in the order of ``Reduction``; not sensitive to translations."""
     value: float
-    """[mm]."""
+    """The amplitude [mm]."""
 
 
 class CondensedCell:
     """The equations of a cell at a trial state, its fluctuation condensed by one factorisation.
 
-    The displacement u is ``carriers`` (2 n, s) times generalised strains, F̄ first, and a periodic
-    w with ``constraints`` . w = 0. All forces and moduli are those of the whole cell.
+    The displacement u is ``carriers`` (2 n, s) times the generalised strains, F̄ first, plus a
+    periodic w with ``constraints`` . w = 0. Forces and moduli are those of the whole cell.
 
-    forces, macro_forces : (free,) on w, without those of the constraints [N/mm], and (s,) on the
-        generalised strains.
-    relaxed, response : (2 count,) change of w that balances it, (2 count, s) its derivatives.
-    condensed : (s, s) moduli with w in equilibrium; ``is_regular``: whether there are any.
-    negative : number of negative eigenvalues of the tangent in w, at fixed strains.
+    forces, macro_forces : (free,) forces on w, without those of the constraints [N/mm], and (s,)
+        forces on the generalised strains.
+    relaxed, response : (2 count,) change of w to balance it, (2 count, s) dw/d(strains).
+    condensed : (s, s) moduli with w in equilibrium; ``is_regular``: whether they exist.
+    negative : number of negative eigenvalues of the tangent in w at fixed strains.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class CondensedCell:
             return
         known = np.column_stack([self._all_forces, coupling, C.T])
         solved, by_constraints = np.hsplit(-factor.solve(known), [1 + coupling.shape[1]])
-        size = C @ by_constraints  # negative definite where the constrained tangent is as K
+        size = C @ by_constraints  # negative definite if the constrained tangent has K's inertia
         missing = C @ solved
         missing[:, 0] += self._violation
         solved = solved - by_constraints @ np.linalg.solve(size, missing)
@@ -119,7 +119,7 @@ class CondensedCell:
 
 
 class LinearisedCell(CondensedCell):
-    """The equations at a trial state of load [-], F̄ (4,) along its axes, w (2 count,) [mm]."""
+    """The equations at a trial state: load [-], F̄ (4,) along its axes, w (2 count,) [mm]."""
 
     def __init__(
         self, cell: PeriodicCell, loading: MacroLoading, load: float, gradient: FloatArray,
@@ -127,7 +127,7 @@ class LinearisedCell(CondensedCell):
     ) -> None:  # fmt: skip
         self.loading, self.load, self.amplitude = loading, load, amplitude
         self.gradient, self.fluctuation, self.area = gradient, fluctuation, cell.cell.area
-        Q = loading.axes  # along which components are, F̄'s among them
+        Q = loading.axes  # axes of the components, also of F̄
         none = np.zeros((0, int(cell.free_dofs.sum())))
         super().__init__(cell, cell.affine @ Q, cell.displaced(Q @ gradient, fluctuation), none)
         if self.is_regular:
@@ -139,13 +139,13 @@ class LinearisedCell(CondensedCell):
 
     @property
     def _unbalanced(self) -> FloatArray:
-        """(4,) mean stress in excess of what is prescribed, times the area [N]; 0 elsewhere."""
+        """(4,) (mean stress - prescribed stress) times area [N]; 0 where F̄ is prescribed."""
         excess = self.macro_forces - self.area * self.load * self.loading.dead
         return np.where(self.loading.free, excess, 0.0)
 
     @property
     def is_solved(self) -> bool:
-        """Whether forces, internal and macroscopic, balance, and the amplitude is met."""
+        """Whether internal and macroscopic forces balance, and the amplitude is met."""
         size, amplitude = np.linalg.norm, self.amplitude
         inner = _LOAD_TOLERANCE * size(self.on_carriers @ self.rate)
         outer = _LOAD_TOLERANCE * size(self.condensed) * size(self.rate)
@@ -155,13 +155,13 @@ class LinearisedCell(CondensedCell):
         return bool(size(self.forces) <= inner and size(self._unbalanced) <= outer and is_met)
 
     def _excess(self, prescribed: Amplitude) -> float:
-        """The amplitude in excess of what is prescribed [mm]."""
+        """The amplitude minus its prescribed value [mm]."""
         return float(prescribed.weights @ self.fluctuation) - prescribed.value
 
     def step(self) -> tuple[float, FloatArray, FloatArray]:
-        """Newton's changes of the load, of F̄ (4,) and of the fluctuation."""
+        """Newton step: changes of the load, of F̄ (4,) and of the fluctuation."""
         free = np.flatnonzero(self.loading.free)
-        # Unknown are the free components of F̄ and, if an amplitude is prescribed, the load.
+        # Unknowns: the free components of F̄ and, if an amplitude is prescribed, the load.
         along: FloatArray = np.zeros((4, len(free) + 1))
         along[free, np.arange(len(free))] = 1.0
         along[:, -1] = self.loading.rate
@@ -193,12 +193,12 @@ class LinearisedCell(CondensedCell):
 
 
 class PeriodicCell:
-    """One cell of a lattice with a material: what its equilibrium equations need.
+    """One cell of a lattice with a material: data of its equilibrium equations.
 
-    ``nodal_mass`` and ``mass`` are the mass matrix of unit density [mm^2], unreduced and reduced,
-    ``filling`` is the share of the cell that is material [-]; ``factorisations`` counts every
-    factorisation of an equilibrium. ``affine`` (2 n, 4) are the displacements of F̄_11, F̄_12,
-    F̄_21 and F̄_22 [mm]; ``free_dofs`` says which reduced unknowns are not fixed.
+    ``nodal_mass`` and ``mass`` are the mass matrix of unit density [mm^2], unreduced and reduced;
+    ``filling`` is the area fraction of material in the cell [-]; ``factorisations`` counts every
+    factorisation of an equilibrium. ``affine`` (2 n, 4): displacements due to F̄_11, F̄_12, F̄_21
+    and F̄_22 [mm]; ``free_dofs``: True for reduced unknowns that are not fixed.
     """
 
     def __init__(self, cell: UnitCell, material: Material) -> None:
@@ -220,13 +220,13 @@ class PeriodicCell:
         self._factor: Factor | None = None
 
     def displacement(self, state: CellState) -> FloatArray:
-        """(n, 2) displacement of the mesh's nodes, affine part included [mm]."""
+        """(n, 2) displacement of the mesh's nodes, including the affine part [mm]."""
         return self.displaced(state.gradient.ravel(), state.fluctuation)
 
     def equilibrium(
         self, loading: MacroLoading, load: float, near: CellState | None = None
     ) -> CellState | None:
-        """The equilibrium at a load, from a state nearby; None if not found, or not sound."""
+        """The equilibrium at a load, from a nearby state; None if not found, or not admissible."""
         guess: FloatArray = np.concatenate([np.eye(2).ravel(), np.zeros(self.reduction.size)])
         if near is not None:
             guess = near.value + (load - near.load) * near.rate
@@ -237,9 +237,9 @@ class PeriodicCell:
         self, loading: MacroLoading, load: float, guess: FloatArray,
         amplitude: Amplitude | None = None,
     ) -> CellState | str:  # fmt: skip
-        """The equilibrium near a guess (4 + 2 count,) of F̄, w and, with an amplitude, the load.
+        """The equilibrium near a guess (4 + 2 count,) of F̄ and w; or the reason if there is none.
 
-        Where there is none, the reason.
+        With an amplitude, ``load`` is also a guess.
         """
         F, w = loading.axes.T @ guess[:4], guess[4:]
         for _ in range(_ITERATIONS):
@@ -260,8 +260,8 @@ class PeriodicCell:
     def negative_eigenvalues(self, loading: MacroLoading, state: CellState) -> int:
         """Number of negative eigenvalues of the tangent in w and the free components of F̄.
 
-        Those of w with F̄ fixed, and of the moduli of the free components (Haynsworth, Linear
-        Algebra Appl. 1 (1968) 73-81). Zero: stable against all that has the cell's period.
+        The sum of those in w with F̄ fixed, and of the moduli of the free components (Haynsworth,
+        Linear Algebra Appl. 1 (1968) 73-81). Zero: stable to perturbations with the cell's period.
         """
         free, Q = loading.free, loading.axes
         moduli = (Q.T @ state.moduli.reshape(4, 4) @ Q)[np.ix_(free, free)]
@@ -271,10 +271,10 @@ class PeriodicCell:
     def critical_distances(
         self, state: CellState, shapes: FloatArray, eigenvalues: FloatArray
     ) -> FloatArray:
-        """(k,) how far modes' own critical loads are from a load, over it, to first order [-].
+        """(k,) relative distances of modes' critical loads from the load, to first order [-].
 
-        By the rates at which their Rayleigh quotients fall along the path at ``state``, just
-        before; ``shapes`` (k, n, 2), mean square 1, and ``eigenvalues`` (k,) are at the load.
+        Computed from the rates of their Rayleigh quotients along the path just before ``state``;
+        ``shapes`` (k, n, 2), with mean square 1, and ``eigenvalues`` (k,) are those at the load.
         """
         fields = shapes.reshape(len(shapes), -1).T
         back = state.value - _BACK * state.load * state.rate
@@ -283,9 +283,9 @@ class PeriodicCell:
         return np.asarray(eigenvalues * _BACK * self.filling * self.cell.area / change)
 
     def factor(self, stiffness: csr_array) -> Factor:
-        """Factorise the stiffness (2 n, 2 n) of the free fluctuations; the same object again.
+        """Factorise the stiffness (2 n, 2 n), reduced to free fluctuations.
 
-        ArithmeticError if it is singular.
+        Every call returns the same object, updated. ArithmeticError if it is singular.
         """
         self.factorisations += 1
         matrix, whole = self._free_entries.copy(), self.reduction.reduced(stiffness)(CENTRE)
@@ -297,7 +297,7 @@ class PeriodicCell:
         return self._factor
 
     def every(self, values: FloatArray) -> FloatArray:
-        """(2 count, ...) values of the free unknowns (free, ...), zero at the others."""
+        """(2 count, ...) values of all unknowns from the free ones (free, ...), zero at others."""
         every = np.zeros((self.reduction.size, *values.shape[1:]))
         every[self.free_dofs] = values
         return every
@@ -310,14 +310,14 @@ class PeriodicCell:
 
 @dataclass(eq=False)
 class CellPath:
-    """The primary path of a cell under one loading; states already found are kept."""
+    """The primary path of a cell under one loading; states already found are stored."""
 
     cell: PeriodicCell
     loading: MacroLoading
     states: list[CellState] = field(default_factory=list)
 
     def at(self, load: float) -> CellState | None:
-        """The equilibrium at a load [-], from the nearest known; None if steps of 1e-6 fail."""
+        """The equilibrium at a load [-], from the nearest known one; None if steps of 1e-6 fail."""
         if not self.states:
             start = self.cell.equilibrium(self.loading, 0.0)
             if start is None:

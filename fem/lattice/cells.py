@@ -1,15 +1,15 @@
 """Unit cells of infinite lattices as T6 meshes that fit exactly onto their own copies.
 
-Each is made of one small block that gmsh meshes and numpy reflects, turns and places, so
-that partner nodes agree to rounding and the mesh has the lattice's own symmetries.
+Each is made of one small block that gmsh meshes and numpy reflects, rotates and places, so
+that partner nodes agree to rounding and the mesh has the lattice's symmetries.
 
-The paper shows a chiral metamaterial without its measures, so that geometry is this project's own
+The paper shows a chiral metamaterial without its dimensions. The geometry here is this project's
 choice: that of Prall & Lakes (1997), doi 10.1016/S0020-7403(96)00025-2, with six ligaments or four:
 
-- Rings (annuli) sit on a hexagonal or square lattice. Each is tied to all its nearest neighbours by
+- Rings (annuli) sit on a hexagonal or square lattice. Each is joined to all nearest neighbours by
   straight ligaments of constant thickness.
-- A ligament's outer edge is tangent to the outer edge of the ring at either end, on opposite sides
-  of the line between the centres. So a ring turns when its ligaments are pushed.
+- A ligament's outer edge is tangent to the outer edge of the ring at both ends, on opposite sides
+  of the line between the centres. So a ring rotates when its ligaments are compressed.
 - No fillets: at the notch where a ligament's inner edge meets a ring, strains are singular, so
   energies and eigenvalues converge more slowly with the mesh than those of round holes.
 """
@@ -41,19 +41,19 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class UnitCell:
-    """A piece of a lattice whose copies, moved by the lattice vectors, make up all of it.
+    """A piece of a lattice whose copies, translated by the lattice vectors, tile the plane.
 
-    An InputError refuses a mesh that is not periodic, and names the nodes without a partner.
+    InputError for a mesh that is not periodic; the message names the nodes without a partner.
     """
 
     mesh: Mesh
-    """T6 [mm]."""
+    """T6 mesh [mm]."""
     lattice: FloatArray
-    """Lattice vectors a1 and a2 as rows (2, 2) [mm]."""
+    """(2, 2) lattice vectors a1 and a2 as rows [mm]."""
     origin: IntArray | None = None
-    """(n,) the number in its file of each node, see ``files``; -1 for one that is not in it."""
+    """(n,) number of each node in its file, see ``files``; -1 for nodes that are not in it."""
     notes: tuple[str, ...] = ()
-    """What a reader of results should know of the mesh, as sentences."""
+    """Texts on the mesh that a reader of results should know."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lattice", np.array(self.lattice, dtype=np.float64))
@@ -61,26 +61,26 @@ class UnitCell:
 
     @cached_property
     def periodicity(self) -> Periodicity:
-        """Which nodes are translates of which."""
+        """The nodes as translates of independent nodes."""
         return find_periodicity(self.mesh, self.lattice)
 
     @cached_property
     def symmetry(self) -> CellSymmetry:
-        """Of the lattice's geometry, whether the mesh has it or not."""
+        """Symmetry of the lattice's geometry, whether or not the mesh has it."""
         return find_symmetry(self.mesh, self.periodicity)
 
     @property
     def area(self) -> float:
-        """Area of the cell, holes included [mm^2]."""
+        """Area of the cell, including holes [mm^2]."""
         return float(abs(np.linalg.det(self.lattice)))
 
     def enlarged(self, m: int, n: int) -> UnitCell:
-        """The cell of m x n copies along a1 and a2, at least one along either."""
+        """The cell of m x n copies along a1 and a2, at least one along each."""
         if m < 1 or n < 1:
             raise InputError(f"enlarged cell: expected at least 1 x 1 copies, got {m} x {n}")
         if m == n == 1:
             return self
-        # Partners' places agree to rounding first: what passed the check is joined.
+        # First make partners' positions agree to rounding, so that all of them are joined.
         _, first = np.unique(self.periodicity.master, return_index=True)
         nodes = self.mesh.nodes[first[self.periodicity.master]]
         nodes = nodes + self.periodicity.shift @ self.lattice
@@ -93,13 +93,13 @@ class UnitCell:
 
 
 _HEXAGONAL = [[1.0, 0.0], [0.5, 0.5 * math.sqrt(3.0)]]
-"""Lattice vectors as rows, of length 1."""
+"""Hexagonal lattice vectors as rows, of length 1."""
 
 
 def square(pitch: float, diameter: float, size: float) -> UnitCell:
     """The primitive cell of circular holes in square stacking, a hole's centre at the origin.
 
-    Distance of the holes' centres l and diameter d, 0 < d < l, and size of the elements [mm].
+    Distance l of the holes' centres, diameter d with 0 < d < l, edge length of the elements [mm].
     """
     _check(pitch, diameter, size)
     quarter = quarter_cell(pitch, diameter, size)
@@ -110,13 +110,13 @@ def square(pitch: float, diameter: float, size: float) -> UnitCell:
 def hexagonal(pitch: float, diameter: float, size: float) -> UnitCell:
     """The primitive cell of circular holes in hexagonal stacking: a hexagon about one hole.
 
-    a1 points along x, a2 stands 60 degrees from it. ``hexagonal(...).enlarged(2, 2)`` is the
-    4-hole cell, which has room for the modes of all three M points. Lengths as in :func:`square`.
+    a1 points along x, a2 at 60 degrees to it. ``hexagonal(...).enlarged(2, 2)`` is the 4-hole cell,
+    which has the period of the modes of all three M points. Lengths as in :func:`square`.
     """
     _check(pitch, diameter, size)
     half, radius, angle = 0.5 * pitch, 0.5 * diameter, math.pi / 6
     rise, long = half * math.tan(angle), half / math.cos(angle)
-    # A twelfth of the hexagon, from the middle of a ligament up to a junction.
+    # A twelfth of the hexagon, from the centre of a ligament to a junction.
     corners = [(radius, 0.0), (half, 0.0), (half, rise), _polar(radius, angle)]
     lengths = [half - radius, rise, long - radius, angle * radius]
     wedge = mesh_block(corners, [divisions_of(length, size) for length in lengths], arcs=[3])
@@ -136,9 +136,9 @@ def _check(pitch: float, diameter: float, size: float) -> None:
 
 HANDEDNESS = ("clockwise", "counterclockwise")
 
-# Shares of the pitch. Ligaments are then 18 times as long as thick, so that they bend rather
-# than shorten, and yet thick enough for elements of pitch / 20. Rings of twice that thickness
-# turn rather than being squeezed: their squeezing is what keeps Poisson's ratio from -1.
+# Relative to the pitch. Ligaments are then 18 times as long as thick, so that they bend rather
+# than shorten, and still thick enough for elements of pitch / 20. Rings of twice that thickness
+# rotate rather than deform; their deformation keeps Poisson's ratio above -1.
 RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS = 0.25, 0.1, 0.05
 
 
@@ -153,17 +153,17 @@ def chiral(
 ) -> UnitCell:
     """The primitive cell of a ring-and-ligament lattice, a ring's centre at the origin.
 
-    a1 points along x; a2 stands 90 degrees (tetrachiral) or 60 degrees (hexachiral) from it.
-    ``enlarged(2, 2)`` has room for modes that change sign from ring to ring. An InputError refuses
-    rings that touch, and ligaments too thick to be apart at their ring or to have a free length.
+    a1 points along x; a2 at 90 degrees (tetrachiral) or 60 degrees (hexachiral) to it.
+    ``enlarged(2, 2)`` has the period of modes that change sign from ring to ring. InputError for
+    rings that touch, and for ligaments so thick that they touch at a ring or have no free length.
 
-    pitch, size : distance of neighbouring rings' centres, and edge length of the elements, at most
-        as long as a wall is thick [mm]. Half of that thickness is a good choice.
-    ligaments : of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
-    ring_radius, ring_thickness, ligament_thickness : outer radius, 0.25 pitch unless given;
-        thickness of the walls, 0.1 and 0.05 pitch [mm].
-    handedness : the sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
-        leaves its ring. One lattice is the mirror image of the other.
+    pitch, size : distance of neighbouring rings' centres; edge length of the elements, at most a
+        wall's thickness [mm]. Half of that thickness is a good choice.
+    ligaments : number per ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal).
+    ring_radius, ring_thickness, ligament_thickness : outer radius, by default 0.25 pitch;
+        thicknesses of ring and ligaments, by default 0.1 and 0.05 pitch [mm].
+    handedness : sense of rotation, "clockwise" or "counterclockwise", in which a ligament, followed
+        outwards, leaves its ring. One lattice is the mirror image of the other.
     """
     radius = RING_RADIUS * pitch if ring_radius is None else ring_radius
     wall = RING_THICKNESS * pitch if ring_thickness is None else ring_thickness
@@ -183,9 +183,9 @@ def chiral(
 
 @dataclass(frozen=True)
 class _RingAndLigaments:
-    """What the boundary is made of [mm].
+    """Dimensions of the boundary of rings and ligaments [mm].
 
-    In the ligament's own frame the ring is about the origin and the ligament runs along x
+    In the ligament's local frame, the ring is centred at the origin and the ligament runs along x
     between y = ring_radius - ligament_thickness and y = ring_radius, up to its middle.
     """
 
@@ -219,7 +219,7 @@ class _RingAndLigaments:
 
     @property
     def middle(self) -> float:
-        """x of the ligament's middle, half its length between tangent points."""
+        """x of the ligament's middle: half its length between the tangent points."""
         across = self.ring_radius - 0.5 * self.ligament_thickness
         return math.sqrt((0.5 * self.pitch) ** 2 - across**2)
 
@@ -229,17 +229,17 @@ class _RingAndLigaments:
         return math.sqrt((2 * self.ring_radius - self.ligament_thickness) * self.ligament_thickness)
 
     def sector(self, size: float) -> MeshBlock:
-        """Half a ligament with its share of the ring, the ligament's middle at (pitch / 2, 0).
+        """Half a ligament with its part of the ring; the ligament's middle is at (pitch / 2, 0).
 
-        The ring is cut halfway between the feet of two ligaments, the ligament across its middle;
-        uniform divisions of that cut are their own image under half a turn.
+        The ring is cut halfway between the feet of two ligaments, the ligament across its middle.
+        Uniform divisions of the latter cut are mapped onto themselves by a rotation by 180 degrees.
         """
         outer, inner = self.ring_radius, self.ring_radius - self.ring_thickness
         y = outer - self.ligament_thickness
         leaves, touches = math.atan2(y, self.foot), 0.5 * math.pi
         free = 2 * math.pi / self.ligaments - (touches - leaves)
         low, high = leaves - 0.5 * free, touches + 0.5 * free
-        sides = [  # from a corner on, and how long
+        sides = [  # first corner and length of each side
             (_polar(inner, low), self.ring_thickness),
             (_polar(outer, low), 0.5 * free * outer),
             ((self.foot, y), self.middle - self.foot),

@@ -1,8 +1,8 @@
-"""Unit cells from files: a mesh that meshio reads, a geometry or a model of gmsh.
+"""Unit cells from files: a mesh in a format of meshio, or a geometry or model of gmsh.
 
-Lengths are millimetres, but for the file's own, of which the unit can be stated. Triangles become a
-plane T6 mesh, see ``foreign``. What the copies of a cell must do to fit together is checked by
-``periodicity``, which names the nodes that don't.
+Lengths are in mm, except in the file, whose unit can be given. Triangles become a plane T6 mesh,
+see ``foreign``. That the copies of a cell fit together is checked by ``periodicity``, which names
+nodes that don't fit.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading, require_file
 
-Blocks = dict[str, list[IntArray]]  # of elements, by meshio's names of these
+Blocks = dict[str, list[IntArray]]  # blocks of elements, by meshio's element names
 
 GEOMETRY = (".geo", ".geo_unrolled", ".step", ".stp", ".brep", ".iges", ".igs")
-"""Suffixes of the files that gmsh meshes."""
+"""Suffixes of geometry files, which gmsh meshes."""
 
 _PROBE = """
 import gmsh, sys
@@ -42,8 +42,8 @@ print("read")
 """
 _PROBE_SECONDS = 300.0
 _FARTHEST = 1e9
-"""From the origin [mm]; a damaged file's nodes are anywhere."""
-_LOWER = ("vertex", "line")  # what meshes hold besides their elements
+"""Largest distance from the origin [mm]; nodes of a damaged file may be anywhere."""
+_LOWER = ("vertex", "line")  # types of lower dimension, which are ignored
 
 
 def read_cell(
@@ -54,18 +54,18 @@ def read_cell(
 ) -> UnitCell:
     """Read the unit cell of a lattice from a file.
 
-    Nodes keep the file's order, ``UnitCell.origin`` says which is which, ``notes`` what had to be
-    changed. An InputError refuses a file that is damaged, no plane mesh of sound triangles or not
-    periodic, and asks for the unit where the cell is unusually small or large.
+    Nodes keep the file's order; ``UnitCell.origin`` gives their numbers in the file, ``notes`` what
+    was changed. InputError for a damaged file, one without a plane mesh of valid triangles, or one
+    that isn't periodic; the message asks for the unit if the cell is unusually small or large.
 
     path : a plane mesh of six-node triangles, in any format of meshio or gmsh; three-node triangles
-        get straight sides with nodes in their middle. Or a geometry for gmsh to mesh (suffixes
+        get mid-side nodes on straight sides. Or a geometry that gmsh meshes (suffixes
         ``GEOMETRY``). A gmsh file's physical surfaces, if any, are the material.
-    lattice : (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is a rectangle along x
-        and y, as wide and as high as its material.
-    size : largest edge length [mm] of the elements of a geometry; None: what it says itself.
-    unit : of the file's own lengths, one of ``foreign.MILLIMETRES``; None: mm. STEP and IGES files
-        say it themselves, and come in mm.
+    lattice : (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is the bounding
+        rectangle of its material along x and y.
+    size : largest edge length of the elements of a geometry [mm]; None: as set in the geometry.
+    unit : unit of lengths in the file, one of ``foreign.MILLIMETRES``; None: mm. STEP and IGES
+        files contain their unit, and are converted to mm.
     """
     path = Path(path)
     require_file(path, "a cell (mesh or geometry)", "draw or export one")
@@ -90,8 +90,8 @@ def cell_from_gmsh(
 ) -> UnitCell:
     """The unit cell in gmsh's current model, which stays open.
 
-    If the model has a mesh, that is taken as it is; if not, it is meshed with sides that are
-    divided alike. Parameters and errors are those of :func:`read_cell`.
+    An existing mesh of the model is used unchanged; otherwise the model is meshed with equal
+    divisions on opposite sides. Parameters and errors are those of :func:`read_cell`.
     """
     if not gmsh.isInitialized():
         raise InputError("expected a gmsh model, got none: call gmsh.initialize() and build one")
@@ -101,7 +101,7 @@ def cell_from_gmsh(
 
 
 def _require_readable(path: Path) -> None:
-    """Let a child read the file first: gmsh aborts the process on some, or ends it."""
+    """Read the file in a child process first, as some files make gmsh abort or exit the process."""
     with reading(path, "a file that gmsh reads", "export it again"):
         command = [sys.executable, "-P", "-c", _PROBE, str(path)]
         done = subprocess.run(command, capture_output=True, timeout=_PROBE_SECONDS, check=False)
@@ -115,7 +115,7 @@ def _merge(path: Path) -> None:
     unit = gmsh.option.getString("Geometry.OCCTargetUnit")
     gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
     try:
-        gmsh.merge(str(path))  # which a child has read
+        gmsh.merge(str(path))  # already read once, in a child process
     finally:
         gmsh.option.setString("Geometry.OCCTargetUnit", unit)
 
@@ -137,7 +137,7 @@ def _from_model(
             mesh_periodically(None if given is None else np.asarray(given / mm))
         except InputError as error:
             raise InputError(f"{source}: {error}") from error
-        except Exception as error:  # gmsh raises nothing else
+        except Exception as error:  # gmsh raises plain exceptions only
             why = " ".join((str(error) or gmsh.logger.getLastError()).split())
             raise InputError(
                 f"{source}: gmsh can't mesh it ({why}); holes must neither overlap nor "
@@ -149,7 +149,7 @@ def _from_model(
 def _current_mesh() -> tuple[FloatArray, Blocks, IntArray]:
     """Nodes (n, 3), elements and nodes' tags (n,) of gmsh's current model.
 
-    Of its material, if it names one.
+    If there are physical surfaces, elements are only those of these.
     """
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
@@ -173,9 +173,9 @@ def _unit_cell(
     source: str,
     unit: str | None,
 ) -> UnitCell:
-    """Check a mesh as it is in files, put it in order, and find its periodicity.
+    """Check a mesh read from a file, bring it into standard form, and find its periodicity.
 
-    ``points`` and elements as the file has them; ``names`` (n,) are the nodes' numbers in it.
+    ``points`` and ``blocks``: nodes and elements of the file; ``names`` (n,): numbers of the nodes.
     """
     cells = {name: np.vstack(parts) for name, parts in blocks.items()}
     kinds = sorted(name for name in cells if not name.startswith(_LOWER) and len(cells[name]))
@@ -201,7 +201,7 @@ def _unit_cell(
 
 
 def _refuse_unless_rectangular(mesh: Mesh) -> None:
-    """On each side of the rectangle around a mesh there must lie sides of elements."""
+    """Raise InputError unless element sides lie on each side of the mesh's bounding rectangle."""
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     middles = mesh.nodes[np.unique(mesh.cells[:, 3:])]
     near = 1e-6 * (high - low).min()

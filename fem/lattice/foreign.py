@@ -1,7 +1,7 @@
-"""Meshes of other programs: their unit of length, their numbering, and whether they are sound.
+"""Meshes of other programs: unit of length, node numbering, and validity of elements.
 
-What is put in order is remembered: which node of the file each node is, and, in sentences, what had
-to be changed.
+A mesh is brought into standard form. The number of each node in the file, and texts on all changes,
+are kept.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
 MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "in": 25.4}
-"""Units of length that a file may be in."""
-_USUAL = 1e-2, 1e3  # widths of a cell [mm]: any other was hardly meant so
+"""Possible units of length of a file, in mm."""
+_USUAL = 1e-2, 1e3  # usual range of a cell's width [mm]: outside it the unit is probably wrong
 _SIDES = ((0, 1), (1, 2), (2, 0))
 
 NUMBERINGS = {
@@ -31,22 +31,22 @@ NUMBERINGS = {
     "row by row: corner, mid-side, corner, two mid-sides, corner": (0, 2, 5, 1, 4, 3),
     "mid-sides 1-2, 2-3, 3-1, then corners": (3, 4, 5, 0, 1, 2),
 }
-"""Other orders of a T6 element's nodes than that of gmsh, VTK and Abaqus (CPE6): which of its nodes
-are the corners and the mid-sides 1-2, 2-3, 3-1."""
-_FAR, _CLOSE = 0.3, 0.12  # of a side: how far from its middle no node, and every node, should be
+"""Orders of a T6 element's nodes other than that of gmsh, VTK and Abaqus (CPE6): indices of the
+corners and of the mid-sides 1-2, 2-3, 3-1 among its nodes."""
+_FAR, _CLOSE = 0.3, 0.12  # distance from a side's middle, over its length: wrong, correct order
 
 
 def millimetres(unit: str | None) -> float:
-    """What one unit of a file is in mm; an InputError refuses unknown ones."""
+    """Length of a file's unit in mm; InputError for unknown units."""
     if unit is not None and unit not in MILLIMETRES:
         raise InputError(f"unit: expected one of {', '.join(MILLIMETRES)}, got {unit!r}")
     return MILLIMETRES[unit or "mm"]
 
 
 def require_unit(points: FloatArray, lattice: FloatArray | None) -> None:
-    """Ask for the unit of nodes that can hardly be in mm, by their own or by the cell's width.
+    """Raise InputError asking for the unit if the nodes' or the cell's width is unusual in mm.
 
-    ``points`` (n, 2) as the file has them; ``lattice`` (2, 2) are the vectors given [mm], if any.
+    ``points`` (n, 2): as in the file; ``lattice`` (2, 2): the given vectors [mm], if any.
     """
     width, low, high = float(np.ptp(points, axis=0).max()), *_USUAL
     ratio = 1.0 if lattice is None else width / float(np.linalg.norm(lattice, axis=1).max())
@@ -64,23 +64,23 @@ def require_unit(points: FloatArray, lattice: FloatArray | None) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ForeignMesh:
-    """A mesh of another program, put in order."""
+    """A mesh of another program in standard form."""
 
     mesh: Mesh
-    """Plane T6, counter-clockwise, without unused nodes."""
+    """Plane T6 mesh, counter-clockwise, without unused nodes."""
     origin: IntArray
-    """(n,) which of the given nodes each node is, in their order; -1 for added mid-sides."""
+    """(n,) index of each node among the given nodes; -1 for added mid-side nodes."""
     notes: tuple[str, ...] = ()
-    """What had to be changed, as sentences."""
+    """Texts on what was changed."""
 
 
 def sound_t6(points: FloatArray, cells: IntArray) -> ForeignMesh:
-    """A plane T6 mesh, counter-clockwise, without unused nodes, the others in their order.
+    """Make a plane T6 mesh, counter-clockwise, without unused nodes; node order is kept.
 
     From points (n, 2), or (n, 3) with z = const [mm], and cells (m, 3) or (m, 6) in gmsh's order or
-    any of ``NUMBERINGS``; sides of three-node triangles get a node in their middle, after all
-    others. An InputError refuses a mesh that isn't plane, has elements upon each other, or a flat
-    or folded one.
+    any of ``NUMBERINGS``; mid-side nodes are added to three-node triangles, after all other nodes.
+    InputError for a mesh that isn't plane, has elements on top of each other, or flat or folded
+    elements.
     """
     used, numbers = np.unique(cells, return_inverse=True)
     nodes, cells = in_plane(points[used]), numbers.reshape(cells.shape).astype(np.int64)
@@ -117,7 +117,7 @@ def sound_t6(points: FloatArray, cells: IntArray) -> ForeignMesh:
 
 
 def _numbering(nodes: FloatArray, cells: IntArray) -> str:
-    """The name of the order that T6 elements (m, 6) are numbered in; "" if that is gmsh's."""
+    """The name of the node order of T6 elements (m, 6); "" for gmsh's order."""
     if _off_middle(nodes, cells) < _FAR:
         return ""
     off = {name: _off_middle(nodes, cells[:, order]) for name, order in NUMBERINGS.items()}
@@ -132,7 +132,7 @@ def _numbering(nodes: FloatArray, cells: IntArray) -> str:
 
 
 def _off_middle(nodes: FloatArray, cells: IntArray) -> float:
-    """How far mid-sides are from the middle of their side: the median over elements [side]."""
+    """Distance of mid-side nodes from their side's middle, over its length; median of elements."""
     off = []
     for k, (p, q) in enumerate(_SIDES):
         a, b, middle = (nodes[cells[:, j]] for j in (p, q, 3 + k))
@@ -167,7 +167,7 @@ def _smallest_jacobians(mesh: Mesh) -> FloatArray:
 
 
 def _gradients(xi: float, eta: float) -> FloatArray:
-    """(6, 2) derivatives of the shape functions."""
+    """(6, 2) derivatives of the T6 shape functions by xi and eta."""
     z = 1.0 - xi - eta
     by_xi = [1 - 4 * z, 4 * xi - 1, 0.0, 4 * (z - xi), 4 * eta, -4 * eta]
     by_eta = [1 - 4 * z, 0.0, 4 * eta - 1, -4 * xi, 4 * xi, 4 * (z - eta)]
@@ -175,5 +175,5 @@ def _gradients(xi: float, eta: float) -> FloatArray:
 
 
 NODES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
-"""Of a T6 element, in its own coordinates; values there determine a Jacobian that is quadratic."""
+"""Nodes of a T6 element in local coordinates; values there determine its quadratic Jacobian."""
 _GRADIENTS = np.array([_gradients(xi, eta) for xi, eta in NODES])

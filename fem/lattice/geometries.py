@@ -1,4 +1,4 @@
-"""Geometries in gmsh's current model, meshed so that the sides of a cell are divided alike."""
+"""Meshing of gmsh's current model with equal divisions on opposite sides of a cell."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from modeharvest.util.errors import InputError
 
 
 def mesh_periodically(lattice: FloatArray | None) -> None:
-    """T6 mesh of the current model whose sides are divided alike where a translation maps them.
+    """T6 mesh of the current model with equal divisions on sides related by a lattice translation.
 
-    ``lattice`` (2, 2) are its vectors as rows, in the model's unit; None: the rectangle around it.
-    An InputError refuses curves that cross.
+    ``lattice`` (2, 2): its vectors as rows, in the model's unit; None: those of the bounding
+    rectangle. InputError for curves that cross.
     """
     mesh = gmsh.model.mesh
     mesh.clear()
@@ -26,7 +26,7 @@ def mesh_periodically(lattice: FloatArray | None) -> None:
         width = np.ptp(mesh.getNodes()[1].reshape(-1, 3)[:, :2], axis=0)
         vectors = np.diag(width) if lattice is None else lattice
         for a, b, shift in _translates([_ends_and_middle(tag) for tag in curves], vectors):
-            if mesh.getPeriodicNodes(1, curves[b])[0] == curves[b]:  # not set by the user
+            if mesh.getPeriodicNodes(1, curves[b])[0] == curves[b]:  # not set periodic by the user
                 affine = np.eye(4)
                 affine[:2, 3] = shift
                 mesh.setPeriodic(1, [curves[b]], [curves[a]], affine.ravel())
@@ -36,7 +36,7 @@ def mesh_periodically(lattice: FloatArray | None) -> None:
 
 
 def _refuse_crossing(curves: set[int]) -> None:
-    """Curves must not cross: gmsh would try to mesh what they enclose, and never end."""
+    """Raise InputError for crossing curves, with which gmsh's mesher would never end."""
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
     points = coordinates.reshape(-1, 3)[order, :2]
@@ -44,7 +44,7 @@ def _refuse_crossing(curves: set[int]) -> None:
     lines = np.searchsorted(tags[order], np.concatenate([[], *ends])).reshape(-1, 2)
     start, along = points[lines[:, 0]], points[lines[:, 1]] - points[lines[:, 0]]
     for p, d in zip(start, along, strict=True):
-        near = 1e-6 * (d @ d)  # what is that near only touches
+        near = 1e-6 * (d @ d)  # closer points count as touching
 
         def apart(a: FloatArray, b: FloatArray, near: float = near) -> NDArray[np.bool_]:
             return np.asarray((np.minimum(a, b) < -near) & (np.maximum(a, b) > near))
@@ -64,7 +64,7 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _ends_and_middle(curve: int) -> FloatArray:
-    """(3, 2) ends, in the order of x and y, and middle of a curve of the current model [mm]."""
+    """(3, 2) ends, sorted by x, then y, and middle of a curve of the current model."""
     low, high = (float(bound[0]) for bound in gmsh.model.getParametrizationBounds(1, curve))
     at = [low, high, 0.5 * (low + high)]
     points = np.array(gmsh.model.getValue(1, curve, at)).reshape(3, 3)[:, :2]
@@ -76,7 +76,7 @@ def _ends_and_middle(curve: int) -> FloatArray:
 def _translates(
     boundary: list[FloatArray], lattice: FloatArray
 ) -> list[tuple[int, int, FloatArray]]:
-    """Pairs of curves, the second being the first moved by a vector; each is in one pair."""
+    """(first, second, vector): pairs of curves related by a translation; each in one pair only."""
     near = 1e-6 * float(np.linalg.norm(lattice, axis=1).min())
     found: list[tuple[int, int, FloatArray]] = []
     paired: set[int] = set()

@@ -1,6 +1,6 @@
-"""Options of a lattice's analysis: macroscopic loading, search of the critical point, waves.
+"""Options of a lattice's analysis: macroscopic loading, search for the critical point, waves.
 
-Plain dataclasses, checked where they are built; neither dolfinx nor gmsh is needed for them.
+Plain dataclasses, checked when they are built; neither dolfinx nor gmsh is needed.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from modeharvest.util.errors import InputError, require_within
 
 @dataclass(frozen=True)
 class CriticalSearch:
-    """How the first critical point is looked for; loads [-]."""
+    """Options of the search for the first critical point; loads [-]."""
 
     largest: float = 0.3
-    """Load up to which to look."""
+    """Load up to which to search [-]."""
     divisions: int = 8
-    """Of each axis of the zone; an even number has the points M and X on the grid."""
+    """Divisions of the zone along each axis; even numbers have the points M and X on the grid."""
     largest_step: float = 0.02
-    """Of the load."""
+    """Largest step of the load [-]."""
     waves: tuple[tuple[float, ...], ...] = ()
-    """Phases [π rad] of the only waves to look at, such as [[1, 1]]; none: all there are."""
+    """Phases [π rad] of the only waves to consider, such as [[1, 1]]; empty: all waves."""
     refine: bool = True
-    """Whether the load's error is estimated on the mesh refined once."""
+    """Whether to estimate the critical load's error, on the mesh refined once."""
 
     def __post_init__(self) -> None:
         _ = self.phases
@@ -41,18 +41,18 @@ class CriticalSearch:
 
     @property
     def phases(self) -> tuple[Wave, ...]:
-        """The waves in rad."""
+        """The waves' phases [rad]."""
         return tuple(phases_in_rad(wave) for wave in self.waves)
 
 
 Wave = tuple[float, float]
 """Phases (k . a1, k . a2) of a Bloch wave from cell to cell [rad]."""
 CENTRE: Wave = (0.0, 0.0)
-"""Γ: the modes with the cell's own period."""
+"""The point Γ: modes with the period of the cell."""
 
 
 def wave_of(given: Any) -> Wave:
-    """A wave vector as two finite phases [rad]; an InputError refuses anything else."""
+    """A wave vector as two finite phases [rad]; InputError for anything else."""
     try:
         phases = np.asarray(given)
     except ValueError:  # rows of different lengths
@@ -66,16 +66,16 @@ def wave_of(given: Any) -> Wave:
 
 
 def phases_in_rad(wave: Sequence[float]) -> Wave:
-    """Units of π to rad; InputError if the wave is not in the plane."""
+    """Convert phases in units of π to rad; InputError unless there are two."""
     p, q = wave_of(wave)
     return math.pi * p, math.pi * q
 
 
 def lattice_vectors(given: ArrayLike, what: str) -> FloatArray:
-    """Two vectors of a lattice as rows (2, 2) [mm]; an InputError, of ``what``, refuses others."""
+    """Two lattice vectors as rows (2, 2) [mm]; InputError, naming ``what``, for other values."""
     try:
         vectors = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):  # words, or rows of different lengths
+    except (TypeError, ValueError):  # text, or rows of different lengths
         vectors = np.empty(0)
     if vectors.shape == (2, 2):
         lengths = np.linalg.norm(vectors, axis=1)
@@ -93,16 +93,16 @@ Rates = tuple[tuple[float | None, float | None], tuple[float | None, float | Non
 
 @dataclass(frozen=True)
 class MacroLoading:
-    """For each component either of F̄ or of P̄ a value proportional to the load e.
+    """Macroscopic loading: each component of either F̄ or P̄ is proportional to the load e.
 
-    F̄_ij = δ_ij + e · gradient_ij [-] where that is given; where it is None, P̄_ij = e · stress_ij
-    [MPa] (first Piola-Kirchhoff, of the cell with its holes; 0, a free side, unless given).
+    F̄_ij = δ_ij + e · gradient_ij [-] where gradient_ij is given. Where it is None, P̄_ij = e ·
+    stress_ij [MPa] (first Piola-Kirchhoff, over the cell including holes; default 0: a free side).
     """
 
     gradient: Rates
     stress: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
     angle: float = 0.0
-    """By which the axes of all these components are turned, counter-clockwise from x, y [rad]."""
+    """Rotation of the axes of all components, counter-clockwise from x and y [rad]."""
 
     def __post_init__(self) -> None:
         if not all(len(x) == 2 == len(x[0]) == len(x[1]) for x in (self.gradient, self.stress)):
@@ -121,14 +121,14 @@ class MacroLoading:
 
     @property
     def axes(self) -> FloatArray:
-        """(4, 4) from components along the turned axes to those along x and y."""
+        """(4, 4) matrix from components along the rotated axes to those along x and y."""
         c, s = math.cos(self.angle), math.sin(self.angle)
         turn = np.array([[c, -s], [s, c]])
         return np.asarray(np.kron(turn, turn))
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """(4,) where F̄ (11, 12, 21, 22 along its axes) is not prescribed but P̄ is."""
+        """(4,) True where P̄ is prescribed instead of F̄ (11, 12, 21, 22 along its axes)."""
         return np.array([g is None for row in self.gradient for g in row])
 
     @property
@@ -143,7 +143,7 @@ class MacroLoading:
 
 
 def uniaxial(axis: int = 0, lateral: float | None = None) -> MacroLoading:
-    """Compression by e along an axis (0: x, 1: y), the other side free or strained by lateral e."""
+    """Compression by e along an axis (0: x, 1: y); lateral sides free, or strained by lateral e."""
     if axis not in (0, 1):
         raise InputError(f"macroscopic loading: expected the axis 0 (x) or 1 (y), got {axis}")
     x, y = (-1.0, lateral) if axis == 0 else (lateral, -1.0)

@@ -1,9 +1,9 @@
-"""Periodicity of a cell's mesh: nodes that a lattice vector carries into each other.
+"""Periodicity of a cell's mesh: nodes that lattice translations map onto each other.
 
-The copies of a cell, moved by all integer combinations of two lattice vectors, must fit
-together: nodes upon nodes wherever material meets material. The cell may have any boundary (a
+The copies of a cell, translated by all integer combinations of two lattice vectors, must fit
+together: nodes must coincide wherever material meets material. The cell may have any boundary (a
 parallelogram, a hexagon, one that cuts through holes), as long as its copies tile the lattice.
-Whether a deformed cell has run into itself :func:`overlaps` finds: contact isn't modelled.
+Contact isn't modelled; :func:`overlaps` detects whether a deformed cell overlaps itself.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
 SAME_PLACE = 1e-6
-"""Of the shorter lattice vector: nodes that near to each other, copies moved, are the same."""
-# Neighbours that can touch a cell whose boundary reaches no further than two cells.
+"""Distance, over the shorter lattice vector, below which translated nodes count as coincident."""
+# Neighbours that can touch a cell whose boundary extends over at most two cells.
 _NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
 
 
@@ -31,12 +31,12 @@ _NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
 class Periodicity:
     """The nodes of a cell as translates of independent ones ("masters").
 
-    Node i is at the position of ``master[i]``, 0 ... count - 1, plus R1 a1 + R2 a2 with the
-    integers R = ``shift[i]``.
+    Node i is at the position of the master ``master[i]``, 0 ... count - 1, plus R1 a1 + R2 a2 with
+    the integers R = ``shift[i]``.
     """
 
     lattice: FloatArray
-    """(2, 2) a1 and a2 as rows [mm]."""
+    """(2, 2) lattice vectors a1 and a2 as rows [mm]."""
     master: IntArray
     shift: IntArray
 
@@ -47,12 +47,12 @@ class Periodicity:
 
 
 def find_periodicity(mesh: Mesh, lattice: FloatArray) -> Periodicity:
-    """Pair the nodes of a T6 mesh that a lattice translation carries into each other.
+    """Pair the nodes of a T6 mesh that lattice translations map onto each other.
 
-    ``lattice`` are its vectors a1 and a2 as rows (2, 2) [mm].
+    ``lattice``: lattice vectors a1 and a2 as rows (2, 2) [mm].
 
-    An InputError refuses parallel vectors, and copies of the cell that overlap, touch without
-    common nodes, or aren't connected along both vectors; it names the nodes.
+    InputError for parallel vectors, and for copies of the cell that overlap, touch without
+    common nodes, or aren't connected along both vectors; the message names the nodes.
     """
     if mesh.element != "T6":
         raise InputError(f"periodic cell: expected a T6 mesh, got {mesh.element}")
@@ -73,7 +73,7 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray) -> Periodicity:
 
 
 def _pairs(nodes: FloatArray, lattice: FloatArray, distance: float) -> IntArray:
-    """(p, 2) numbers of nodes that a nonzero translation carries from one to the other."""
+    """(p, 2) pairs of nodes that a nonzero lattice translation maps onto each other."""
     tree, found = cKDTree(nodes), []
     for r in _NEIGHBOURS:
         near, partner = tree.query(nodes + np.array(r) @ lattice, distance_upper_bound=distance)
@@ -93,11 +93,11 @@ def _refuse_overlap(mesh: Mesh, lattice: FloatArray, boundary: IntArray) -> None
 
 
 def _refuse_hanging(mesh: Mesh, lattice: FloatArray, sides: IntArray, pairs: IntArray) -> None:
-    """Material may meet another copy's material only where all three nodes of a side agree."""
+    """Raise InputError where copies touch along sides whose three nodes don't coincide."""
     matched = np.isin(sides, pairs).all(axis=1)
     a, middle, b = mesh.nodes[sides[~matched]].transpose(1, 0, 2)
     along = b - a
-    # A little outside of the side: in the void if the surface is free.
+    # Points slightly outside the side lie in the void if the surface is free.
     outside = middle + 0.02 * np.stack([along[:, 1], -along[:, 0]], axis=1)
     covered = _covered(mesh, lattice, outside)
     if covered.any():
@@ -135,7 +135,7 @@ def _inside(points: FloatArray, triangles: FloatArray, depth: float = 0.0) -> Bo
 
 
 def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
-    """The lattice must be one body that holds together along both lattice vectors."""
+    """Raise InputError unless the lattice is one body connected along both lattice vectors."""
     piece = _pieces(found.master[mesh.cells], found.count)[found.master]
     if piece.max() > 0:
         largest = np.argmax(np.bincount(piece))
@@ -143,7 +143,7 @@ def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
             "periodic cell: expected one body, got parts that nothing holds: "
             f"{_named(np.flatnonzero(piece != largest), mesh.nodes)}; connect or remove them"
         )
-    # Differing shifts of nodes that are the same master and in the same piece.
+    # Differences of shifts between nodes with the same master in the same piece.
     piece = _pieces(mesh.cells, len(mesh.nodes))
     order = np.lexsort((piece, found.master))
     is_same = (np.diff(found.master[order]) == 0) & (np.diff(piece[order]) == 0)
@@ -160,31 +160,31 @@ def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
 
 
 def _pieces(cells: IntArray, count: int) -> IntArray:
-    """(count,) which connected piece each node belongs to."""
+    """(count,) number of the connected piece that each node belongs to."""
     start, end = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
     links = coo_array((np.ones(len(start)), (start, end)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
 def _named(numbers: IntArray, nodes: FloatArray) -> str:
-    """'3 nodes: 5 at (0, 1.2) mm, ...' for a message."""
+    """Text for a message, such as '3 nodes: 5 at (0, 1.2) mm, ...'."""
     places = (f"{k} at ({nodes[k, 0]:.5g}, {nodes[k, 1]:.5g}) mm" for k in numbers[:4])
     more = ", ..." if len(numbers) > 4 else ""
     return f"{len(numbers)} nodes: {', '.join(places)}{more}"
 
 
-# A T6 as four triangles.
+# A T6 element divided into four triangles.
 PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-_DEPTH = 1e-3  # of a triangle's height: what doesn't count as overlap
+_DEPTH = 1e-3  # depth, relative to a triangle's height, that doesn't count as overlap yet
 
 
 def overlaps(
     mesh: Mesh, lattice: FloatArray, gradient: FloatArray, displacement: FloatArray
 ) -> bool:
-    """Whether material of a periodic cell lies upon itself or upon its copies.
+    """Whether the material of a deformed periodic cell overlaps itself or its copies.
 
-    T6 mesh and lattice vectors (rows) are undeformed [mm]; F̄ (2, 2) carries the copies along; the
-    displacement is (n, 2) of the nodes [mm].
+    T6 mesh and lattice vectors (rows) are undeformed [mm]; ``gradient`` (2, 2) is F̄, which moves
+    the copies; ``displacement`` (n, 2) is that of the nodes [mm].
     """
     nodes, vectors = mesh.nodes + displacement, lattice @ gradient.T
     triangles = nodes[mesh.cells[:, PARTS].reshape(-1, 3)]

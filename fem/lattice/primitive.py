@@ -1,4 +1,4 @@
-"""The primitive cell of a supercell: part of its mesh, where that repeats like the geometry."""
+"""The primitive cell of a supercell, as a part of its mesh if the mesh has that period."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from modeharvest.fem.lattice.cells import UnitCell
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
-_SAME = 3e-6  # shares of lattice vectors
+_SAME = 3e-6  # in fractions of lattice vectors
 
 
 def primitive_cell(cell: UnitCell, wanted: bool = True) -> UnitCell:
-    """The primitive cell of a lattice, with a note; the same cell if it is one, or not ``wanted``.
+    """The primitive cell of a lattice, with a note; the same cell if primitive or not ``wanted``.
 
-    Its elements and nodes are the mesh's own. An InputError refuses a supercell that is meshed
-    differently from one primitive cell to the next. That is not good enough for stability: what
-    alternates between them has the supercell's period, so the irregularities of the mesh act as
-    imperfections, there is no bifurcation, and a degenerate set is split.
+    Its elements and nodes are those of the mesh. InputError for a supercell whose mesh differs
+    between its primitive cells. Such a mesh can't be used for stability: modes that alternate
+    between the cells have the supercell's period, so mesh irregularities act as imperfections,
+    there is no bifurcation, and degenerate modes are split.
     """
     count, vectors = len(cell.symmetry.translations), cell.symmetry.primitive
     if count == 1:
@@ -50,7 +50,7 @@ def primitive_cell(cell: UnitCell, wanted: bool = True) -> UnitCell:
 
 
 def _is_uniform(cell: UnitCell) -> bool:
-    """Whether the translations of a cell's geometry carry nodes onto nodes."""
+    """Whether the translations of a cell's geometry map nodes onto nodes."""
     inverse, nodes = np.linalg.inv(cell.lattice), cell.mesh.nodes
     tree = cKDTree(_in_one(nodes @ inverse), boxsize=1.0)
     moved = [_in_one((nodes + move) @ inverse) for move in cell.symmetry.translations]
@@ -58,18 +58,18 @@ def _is_uniform(cell: UnitCell) -> bool:
 
 
 def _in_one(shares: FloatArray) -> FloatArray:
-    """Shares of lattice vectors in [0, 1)."""
-    return np.asarray(np.mod(np.mod(shares, 1.0), 1.0))  # -1e-17 has become 1
+    """Fractional coordinates, reduced to [0, 1)."""
+    return np.asarray(np.mod(np.mod(shares, 1.0), 1.0))  # twice, as -1e-17 becomes 1
 
 
 def _representatives(mesh: Mesh, vectors: FloatArray) -> IntArray:
-    """Of elements that translations carry into each other, that nearest to the mesh's middle."""
+    """From each set of elements related by translations, the one nearest to the mesh's centre."""
     centres = mesh.nodes[mesh.cells[:, :3]].mean(axis=1)
     tree = cKDTree(_in_one(centres @ np.linalg.inv(vectors)), boxsize=1.0)
     pairs = tree.query_pairs(10 * _SAME, output_type="ndarray")
     n = len(centres)
     _, kind = connected_components(coo_array((np.ones(len(pairs)), pairs.T), shape=(n, n)))
-    # Slightly aside, so that no two are as near.
+    # Slightly off the centre, so that no two are equally near.
     middle = centres.mean(axis=0) + [0.0137, 0.0071] @ vectors
     order = np.argsort(np.linalg.norm(centres - middle, axis=1), kind="stable")
     return np.sort(order[np.unique(kind[order], return_index=True)[1]])

@@ -1,9 +1,9 @@
-"""Symmetries of a cell's geometry: its primitive cell, and turns and mirrors, by its holes' edges.
+"""Symmetries of a cell's geometry, from its holes' edges: primitive cell, rotations, reflections.
 
-The mesh need not have them: a gmsh mesh of four equal holes is as good as one that was copied. In
-the lattice of a connected body all edges are closed loops around holes. A symmetry carries every
-loop onto a loop; candidates are read off their centroids, and must carry all corners of the edges
-onto the edges, up to what elements make of a smooth curve.
+The mesh need not have these symmetries: a gmsh mesh of four equal holes is as good as a copied one.
+In the lattice of a connected body, all edges are closed loops around holes. A symmetry maps every
+loop onto a loop. Candidates follow from the loops' centroids; they must map all corners of the
+edges onto edges, within the error of approximating a smooth curve by elements.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from modeharvest.fem.lattice.periodicity import Periodicity
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 
 _SAMPLES = np.linspace(0.0, 1.0, 17)  # along a side
-_SHARE = 5e-4  # of a side's length: what edges differ by at least
-_ALIKE = 1e-2  # relative: areas of equal holes
+_SHARE = 5e-4  # of a side's length: least tolerance of edges
+_ALIKE = 1e-2  # relative tolerance of the areas of equal holes
 _SAME_LENGTH = 1e-5  # relative
 
 
@@ -29,30 +29,30 @@ class Symmetry:
     """The map x -> turn x + move of the lattice onto itself."""
 
     turn: FloatArray
-    """(2, 2) a rotation or a mirror."""
+    """(2, 2) rotation or reflection."""
     move: FloatArray
-    """(2,) [mm]."""
+    """(2,) translation [mm]."""
 
     def keeps(self, gradient: FloatArray) -> bool:
-        """Whether the lattice keeps it under F̄ (2, 2), the same one for all its copies."""
+        """Whether the lattice keeps this symmetry under a macroscopic F̄ (2, 2)."""
         off = self.turn @ gradient @ self.turn.T - gradient
         return bool(np.abs(off).max() <= 1e-2 * np.abs(gradient - np.eye(2)).max() + 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
 class CellSymmetry:
-    """What maps a lattice, given by one cell of it, onto itself."""
+    """The symmetries of a lattice that is given by one cell."""
 
     primitive: FloatArray
-    """(2, 2) the shortest vectors a1, a2 as rows [mm]; the cell's own where that is primitive."""
+    """(2, 2) shortest vectors a1, a2 as rows [mm]; those of the cell if it is primitive."""
     translations: FloatArray
-    """(N, 2) all that are different for the cell, 0 among them [mm]: N primitive cells."""
+    """(N, 2) distinct translations within the cell, including 0 [mm]; N: its primitive cells."""
     operations: tuple[Symmetry, ...] = ()
-    """Turns and mirrors, each once, the identity left out."""
+    """Rotations and reflections, each once, without the identity."""
 
 
 def find_symmetry(mesh: Mesh, periodicity: Periodicity) -> CellSymmetry:
-    """The symmetries of the lattice that a cell makes up."""
+    """The symmetries of the lattice made of copies of a cell."""
     lattice, nowhere = periodicity.lattice, np.zeros((1, 2))
     edges = HoleEdges(mesh, periodicity)
     if not len(edges.areas):
@@ -61,7 +61,7 @@ def find_symmetry(mesh: Mesh, periodicity: Periodicity) -> CellSymmetry:
     count = max(len(moves), 1)
     turns = np.rint(count * np.array(moves or nowhere) @ np.linalg.inv(lattice)) / count
     translations = np.unique(np.mod(turns, 1.0), axis=0) @ lattice
-    if len(translations) != count or len(edges.areas) % count:  # no group: by chance alike
+    if len(translations) != count or len(edges.areas) % count:  # no group: accidental matches
         count, translations = 1, nowhere
     reduced = _reduced(translations, lattice, count)
     operations = []
@@ -73,9 +73,9 @@ def find_symmetry(mesh: Mesh, periodicity: Periodicity) -> CellSymmetry:
 
 
 class HoleEdges:
-    """The edges of a lattice's holes: area (negative) and centroid [mm] of each.
+    """The edges of a lattice's holes: area (negative) [mm^2] and centroid [mm] of each.
 
-    The corners on them are the nodes ``masters`` (s,), which lie on number ``hole`` (s,) in the
+    The corners on the edges are the nodes ``masters`` (s,), each on the hole ``hole`` (s,) in the
     cell ``copy`` (s, 2). ``sharpest``: the largest kink of a notch [rad].
     """
 
@@ -85,7 +85,7 @@ class HoleEdges:
         _, number, count = np.unique(
             periodicity.master[sides[:, 1]], return_inverse=True, return_counts=True
         )
-        sides = sides[count[number.ravel()] == 1]  # without another copy's material beside
+        sides = sides[count[number.ravel()] == 1]  # without material of another copy next to it
         a, middle, b = mesh.nodes[sides].transpose(1, 0, 2)
         self.corners, bow = a, 2.0 * (a + b) - 4.0 * middle
         s = _SAMPLES[:, None, None]
@@ -129,7 +129,7 @@ class HoleEdges:
         self.areas, self.centroids = np.array(areas), np.array(centroids).reshape(-1, 2)
 
     def _roughness(self, slope: FloatArray, length: FloatArray) -> float:
-        """How far sides are off a smooth edge [mm], by the kinks between them; corners aside."""
+        """Deviation of sides from a smooth edge [mm], from the median kink between them."""
         out, into = slope[-1], slope[0][self._following]
         turn = out[:, 0] * into[:, 1] - out[:, 1] * into[:, 0]
         kink = np.arctan2(turn, np.sum(out * into, axis=1))
@@ -137,14 +137,14 @@ class HoleEdges:
         return float(1.5 / 8.0 * np.median(np.abs(kink)) * np.median(length))
 
     def candidates(self, turn: FloatArray) -> FloatArray:
-        """(c, 2) moves after a turn that carry the rarest hole onto one like it, in the cell."""
+        """(c, 2) translations after ``turn`` that map the rarest hole onto an equal one [mm]."""
         alike = np.abs(self.areas[:, None] - self.areas) <= _ALIKE * np.abs(self.areas)
         rarest = int(np.argmin(alike.sum(axis=1)))
         moves = self.centroids[alike[rarest]] - turn @ self.centroids[rarest]
         return np.asarray(np.mod(np.round(moves @ self._inverse, 9), 1.0) @ self.lattice)
 
     def has(self, turn: FloatArray, move: FloatArray) -> bool:
-        """Whether a turn and a move carry all edges onto edges."""
+        """Whether a rotation or reflection, and a translation, map all edges onto edges."""
         every = np.mod((self.corners @ turn.T + move) @ self._inverse, 1.0) @ self.lattice
         return all(self._are_on(part).all() for part in (every[::17], every))
 
@@ -157,9 +157,9 @@ class HoleEdges:
 
 
 def _reduced(translations: FloatArray, lattice: FloatArray, count: int) -> FloatArray:
-    """(2, 2) the shortest two vectors of a lattice with ``count`` translations in its cell.
+    """(2, 2) shortest two vectors of a lattice with ``count`` translations in its cell [mm].
 
-    Counter-clockwise, the first one along x as far as possible, and 60 degrees where that or 120.
+    Counter-clockwise, the first as close to x as possible; at 60 degrees rather than 120.
     """
     steps = np.array(list(product(range(-4, 5), repeat=2))) @ lattice
     every = (translations[:, None] + steps).reshape(-1, 2)
@@ -173,7 +173,7 @@ def _reduced(translations: FloatArray, lattice: FloatArray, count: int) -> Float
 
 
 def _turns(vectors: FloatArray) -> list[FloatArray]:
-    """The rotations and mirrors of a lattice of shortest vectors."""
+    """The rotations and reflections of a lattice, given by its shortest vectors."""
     gram, found = vectors @ vectors.T, []
     for entries in product((-1, 0, 1), repeat=4):
         B = np.array(entries).reshape(2, 2)

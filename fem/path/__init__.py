@@ -1,1 +1,1 @@
-"""A specimen's equilibrium path: Newton's method, stability, the critical point, the branches."""
+"""A specimen's equilibrium path: Newton's method, stability, critical point, branches."""

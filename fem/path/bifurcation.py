@@ -1,9 +1,9 @@
 """The first bifurcation of a path: its critical point, located and proved, and its branches.
 
 At the critical point the critical eigenvalue is zero; the inertia on both sides is the proof. A
-branch that leaves there is followed by its mode's amplitude, with the strain as an unknown: that
-system is regular at the pitchfork itself. :func:`follow_branch` meets given strains exactly, under
-prescribed strain; :func:`follow_to_pattern` ends where the pattern has a given amplitude.
+branch from there is followed by its mode's amplitude, with the strain as an unknown: this system
+is regular at the pitchfork itself. :func:`follow_branch` computes states at given strains exactly,
+with prescribed strain; :func:`follow_to_pattern` ends where the pattern has a given amplitude.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from modeharvest.fem.path.newton import Constraint
 from modeharvest.fem.path.stability import Mode
 from modeharvest.util.arrays import FloatArray
 
-_SEARCHES = 20  # equilibria tried on the way to one critical point
-_NEAR = 1e-3  # of strain: the next estimate is right
-_ZERO = 1e-3  # of the eigenvalue at the unstable state: so small it has to become
+_SEARCHES = 20  # most equilibria computed to locate a critical point
+_NEAR = 1e-3  # strain distance below which the next estimate is accurate
+_ZERO = 1e-3  # tolerance of the eigenvalue, relative to that at the unstable state
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Critical:
     u: PETSc.Vec
     """Critical nominal strain [-], and the displacement there."""
     modes: list[Mode]
-    """Those whose eigenvalues are nearest to zero, the critical one(s) first."""
+    """The modes whose eigenvalues are nearest to zero, the critical one(s) first."""
     eigenvalues: list[tuple[float, float]]
     """(strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed."""
     below: int
@@ -51,16 +51,16 @@ class Critical:
 
 
 def locate_critical(follower: PathFollower, low: State, high: State) -> Critical | None:
-    """The first critical point between a stable state and the unstable one reached last.
+    """The first critical point between a stable state and the unstable state reached last.
 
-    Any field's curvature x . K x is above the lowest eigenvalue, by the square of what it is off
-    the mode. So the lowest strain where that of a known mode passes zero on the interpolated path
-    is an estimate from above; an equilibrium there gives better modes, and quadratic convergence.
-    Two equilibria a tolerance below and above are the proof; where the inertia below isn't zero,
-    another mode became critical before, and the search goes on.
+    The curvature x . K x of a normalised field exceeds the lowest eigenvalue by the square of its
+    deviation from the mode. So the lowest strain where the curvature of a known mode passes zero on
+    the interpolated path is an upper estimate; an equilibrium there gives better modes, with
+    quadratic convergence. Two equilibria a tolerance below and above are the proof. If the inertia
+    below isn't zero, another mode became critical before, and the search continues.
 
-    None if an equilibrium in between can't be found, or if no eigenvalue passes zero: then the
-    two states are not on one path.
+    None if an equilibrium in between can't be found, or if no eigenvalue passes zero: then the two
+    states are not on one path.
     """
     search = _CriticalBracket(follower, low, high)
     for k in range(_SEARCHES):
@@ -82,18 +82,18 @@ def locate_critical(follower: PathFollower, low: State, high: State) -> Critical
 class _CriticalBracket:
     """A bracket of the first critical point, and the modes that may become critical in it.
 
-    ``latest`` is the strain of the state reached last; ``is_over`` says that there is no point.
+    ``latest``: strain of the state reached last; ``is_over``: True if there is no critical point.
     """
 
     def __init__(self, follower: PathFollower, low: State, high: State) -> None:
         self.follower, self.low, self.high = follower, low, high
         self.latest, self.is_over = high.strain, False
         self._visited = [(high, follower.modes)]
-        self._offs: list[float] = []  # of the unstable states reached, from the next estimate
+        self._offs: list[float] = []  # distances of unstable states from the next estimates
         self._candidates = [mode for mode in follower.modes if mode.eigenvalue < 0]
 
     def estimate(self) -> float | None:
-        """Where the curvature of a candidate first passes zero; None if none does."""
+        """Strain at which the curvature of a candidate first passes zero; None if none does."""
         low, strain = self.low.strain, self.high.strain
         tolerance = 0.1 * self.follower.options.critical_tolerance
         curvature = cache(self._curvature)
@@ -114,7 +114,7 @@ class _CriticalBracket:
         return self.follower.structure.curvature(u, mode.vector)
 
     def step(self, strain: float) -> State | None:
-        """An equilibrium within the bracket, which becomes one of its ends; None if not found."""
+        """Compute an equilibrium, which becomes an end of the bracket; None if not found."""
         state = self.follower.equilibrium(strain, displacement_at([self.low, self.high], strain))
         if state is None:
             return None
@@ -130,7 +130,7 @@ class _CriticalBracket:
     def prove(self, strain: float) -> Critical | None:
         """The critical point near a strain, if the inertia on both sides proves it the first.
 
-        If not, the bracket is smaller, or there is nothing more to look for.
+        Otherwise the bracket is reduced, or ``is_over`` is set.
         """
         follower, tolerance = self.follower, self.follower.options.critical_tolerance
         below = self.step(strain - tolerance)
@@ -150,7 +150,7 @@ class _CriticalBracket:
             values.append((state.strain, most_similar.eigenvalue))
         values.append((above.strain, beyond))
         (last, final), (far, first) = values[-2], values[0]
-        # In proportion to the distance, unless the two states are not on one path.
+        # Proportional to the distance, unless the two states are not on one path.
         share = 10 * tolerance / (far - last)
         if final > max(share, _ZERO) * abs(first):
             self.is_over = True
@@ -166,8 +166,8 @@ def follow_branch(
 ) -> list[State]:
     """States on the bifurcated branch at the ``targets`` (ascending strains).
 
-    One for each target; fewer if the branch could not be followed that far. ``sign``, +1 or -1,
-    is which of the two branches, ``length`` what ``first_amplitude`` refers to, the pitch [mm].
+    One for each target; fewer if the branch could not be followed that far. ``sign`` (+1, -1)
+    selects one of the two branches; ``length``: the pitch, for ``first_amplitude`` [mm].
     """
     weights, start = _start(follower, critical, sign)
     points = [start]
@@ -179,7 +179,7 @@ def follow_branch(
         target, amplitude = targets[len(found)], reach
         is_near = load_at(points, reach) >= target
         if is_near:
-            before = points[-1] if points[-1].load < target else points[-2]  # stepped beyond it
+            before = points[-1] if points[-1].load < target else points[-2]  # a step went beyond it
             amplitude = amplitude_at(points, target, before.amplitude, reach)
             state = follower.equilibrium(target, value_at(points, amplitude))
         else:
@@ -193,7 +193,7 @@ def follow_branch(
             reach = 0.5 * (points[-1].amplitude + amplitude)
             if reach - points[-1].amplitude < shortest:
                 return found
-            follower.linearisation = None  # it may be that of the state refused
+            follower.linearisation = None  # may belong to the refused state
             continue
         points.append(_point(state, weights, reached))
         reach = follower.options.growth * reached
@@ -204,8 +204,8 @@ def follow_branch(
 
 
 PATTERN_TOLERANCE = 0.02
-"""How near to the target amplitude is near enough [-]."""
-_FIRST, _SHORTEST = 0.25, 0.01  # steps along the branch, in shares of the target amplitude
+"""Relative tolerance of the target amplitude [-]."""
+_FIRST, _SHORTEST = 0.25, 0.01  # steps along the branch, over the target amplitude
 
 
 def follow_to_pattern(
@@ -214,9 +214,9 @@ def follow_to_pattern(
     measure: Callable[[FloatArray], float],
     target: float,
 ) -> tuple[State | None, float]:
-    """Follow a branch, which may turn back, until its pattern has a given amplitude.
+    """Follow a branch, whose strain may turn back, until its pattern has a given amplitude.
 
-    ``measure`` is the amplitude in nodal displacements (n, 2), ``target`` that to reach [mm].
+    ``measure``: amplitude in nodal displacements (n, 2); ``target``: amplitude to be reached [mm].
     Returns the last state, None if there is none, and the pattern's amplitude there [mm].
     """
     weights, start = _start(follower, critical)
@@ -228,7 +228,7 @@ def follow_to_pattern(
         strain, guess = load_at(points, amplitude), value_at(points, amplitude)
         found = follower.equilibrium(strain, guess, constraint)
         if found is None:
-            step, follower.linearisation = 0.5 * step, None  # it may belong to the failed state
+            step, follower.linearisation = 0.5 * step, None  # may belong to the failed state
             continue
         points.append(_point(found, weights, amplitude))
         state, reached = found, measure(follower.structure.nodal(found.u))
@@ -241,7 +241,7 @@ def follow_to_pattern(
 def _start(
     follower: PathFollower, critical: Critical, sign: int = 1
 ) -> tuple[PETSc.Vec, BranchPoint]:
-    """Weights of the amplitude, the largest displacement in the mode, and the branch's start."""
+    """Weights that give the amplitude (largest displacement in the mode), and the first point."""
     mode = critical.modes[0]
     largest = sign * follower.structure.largest(mode.vector)
     start = BranchPoint(0.0, critical.strain, 0.0, critical.u, (1.0 / largest) * mode.vector)

@@ -1,8 +1,8 @@
 """Continuation of a path: predictors by tangent or cubic, and the primary path by nominal strain.
 
-A predictor extrapolates the tangent of one point, or the cubic through two; ``newton`` corrects.
-On a mesh with the specimen's symmetries the first bifurcation is a pitchfork: the primary path
-keeps the symmetry and goes on, unstable; two branches that break it leave sideways
+A predictor extrapolates along the tangent of one point, or the cubic through two points; ``newton``
+corrects. On a mesh with the specimen's symmetries, the first bifurcation is a pitchfork: the
+primary path keeps the symmetry and continues, unstable; two branches that break it leave the path
 (``bifurcation``).
 """
 
@@ -24,7 +24,7 @@ from modeharvest.util.progress import Progress, silent
 
 
 def hermite_weights(a: float, b: float, at: float) -> tuple[float, float, float, float]:
-    """Weights of value and slope at ``a``, value and slope at ``b``."""
+    """Weights, for the value at ``at``, of value and slope at ``a``, and at ``b`` (Hermite)."""
     h = b - a
     t = (at - a) / h
     before, after = (1 - t) ** 2, t**2
@@ -32,9 +32,9 @@ def hermite_weights(a: float, b: float, at: float) -> tuple[float, float, float,
 
 
 def extrapolate(points: Sequence[tuple[float, Any, Any]], at: float) -> Any:
-    """The value at a parameter, from (parameter, value, rate) of one point or of the last two.
+    """Extrapolate to a parameter from (parameter, value, rate) of one or of the last two points.
 
-    Values may be numbers, arrays or PETSc vectors: anything with sums and multiples.
+    Values may be numbers, arrays or PETSc vectors: anything that can be added and scaled.
     """
     b, value, rate = points[-1]
     if len(points) == 1:
@@ -47,7 +47,7 @@ def extrapolate(points: Sequence[tuple[float, Any, Any]], at: float) -> Any:
 def _combined(weights: Sequence[float], values: Sequence[Any]) -> Any:
     total = weights[0] * values[0]
     for weight, value in zip(weights[1:], values[1:], strict=True):
-        if hasattr(total, "axpy"):  # PETSc's, in place
+        if hasattr(total, "axpy"):  # a PETSc vector, in place
             total.axpy(weight, value)
         else:
             total = total + weight * value
@@ -56,38 +56,38 @@ def _combined(weights: Sequence[float], values: Sequence[Any]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class BranchPoint:
-    """A point of a branch by its mode's amplitude; the rates are derivatives by that."""
+    """A point of a branch, parametrised by amplitude; rates are derivatives by the amplitude."""
 
     amplitude: float
-    """[mm]."""
+    """Amplitude of the mode [mm]."""
     load: float
-    """[-]."""
+    """Load, such as the nominal strain [-]."""
     load_rate: float
     value: Any
-    """Of the state, such as displacements [mm]."""
+    """The state, such as displacements [mm]."""
     rate: Any
 
 
 def load_at(points: Sequence[BranchPoint], amplitude: float) -> float:
-    """The load expected at an amplitude, from one point or the last two."""
+    """The load extrapolated to an amplitude, from one point or the last two."""
     known = [(p.amplitude, p.load, p.load_rate) for p in points[-2:]]
     return float(extrapolate(known, amplitude))
 
 
 def value_at(points: Sequence[BranchPoint], amplitude: float) -> Any:
-    """The state expected at an amplitude, from one point or the last two."""
+    """The state extrapolated to an amplitude, from one point or the last two."""
     return extrapolate([(p.amplitude, p.value, p.rate) for p in points[-2:]], amplitude)
 
 
 def amplitude_at(points: Sequence[BranchPoint], load: float, low: float, high: float) -> float:
-    """Where ``load_at`` meets a load that lies between its values at two amplitudes."""
+    """Amplitude between ``low`` and ``high`` at which ``load_at`` equals a given load."""
     return float(brentq(lambda amplitude: load_at(points, amplitude) - load, low, high))
 
 
-_MISS = 0.2  # of a step, by which a prediction may be off on a path without a bifurcation
-_STRETCH = 0.1  # of a step, by which steps may be longer if one is saved
-_MODES = 3  # computed, or all that are negative and one more
-_RESIDUAL = 3e-3  # of modes: a hundred thousandth of their eigenvalues
+_MISS = 0.2  # largest error of a prediction, over the step, on a path without bifurcation
+_STRETCH = 0.1  # largest relative extension of steps if that saves a step
+_MODES = 3  # number of modes computed, or all negative ones and one more
+_RESIDUAL = 3e-3  # residual tolerance of modes; their eigenvalues then have errors of 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,26 +95,26 @@ class State:
     """An equilibrium state and its stability."""
 
     strain: float
-    """Nominal [-]."""
+    """Nominal strain [-]."""
     u: PETSc.Vec
     """Displacement [mm]."""
     tangent: PETSc.Vec
     """du/d(strain) [mm]."""
     negative_pivots: int
     eigenvalues: tuple[float, ...] = ()
-    """The lowest ones of the tangent stiffness [N/mm^4], if any were computed."""
+    """Lowest eigenvalues of the tangent stiffness [N/mm^4], if computed."""
 
 
 @dataclass(eq=False)
 class PathFollower:
-    """Follows the paths of one structure; the last state's factor serves the next step."""
+    """Follows the paths of one structure; the last state's factor is reused in the next step."""
 
     structure: Structure
     options: PathOptions = field(default_factory=PathOptions)
     progress: Progress = silent
     linearisation: Linearisation | None = None
     modes: list[Mode] = field(default_factory=list)
-    """Both of the state found last; the modes are its lowest ones."""
+    """Linearisation and lowest modes of the state found last."""
 
     def __post_init__(self) -> None:
         self.mass = self.structure.mass()
@@ -133,18 +133,18 @@ class PathFollower:
     ) -> State | None:
         """The equilibrium near ``guess``, at ``strain`` or where the constraint holds.
 
-        None if Newton does not get there, or gets to a state with a reversed element.
+        None if Newton's method doesn't converge, or converges to a state with inverted elements.
         """
         found = correct(self.structure, guess, strain, self.linearisation, constraint)
         if found is None or self.structure.smallest_jacobian(found.u) <= 0.0:
-            self.linearisation = None  # it may be that of a wrong state
+            self.linearisation = None  # may belong to a wrong state
             return None
         return self._settle(found.u, found.strain, found.load, with_modes)
 
     def _settle(
         self, u: PETSc.Vec, strain: float, load: PETSc.Vec, with_modes: bool = True
     ) -> State:
-        """Factorise at a converged equilibrium: its inertia, modes, and rate along the path."""
+        """Factorise at a converged equilibrium; compute inertia, modes, rate along the path."""
         eigenvalues: tuple[float, ...] = ()
         factor = self.structure.factor(u)
         if with_modes:
@@ -161,14 +161,14 @@ class PathFollower:
         until_unstable: bool = False,
         refuse_unstable: bool = False,
     ) -> bool:
-        """Extend ``states`` through all ``targets`` (ascending strains), each met exactly.
+        """Extend ``states`` through all ``targets`` (ascending strains), each reached exactly.
 
-        False where no step down to 1e-5 of strain converges.
+        False if no step down to a strain of 1e-5 converges.
 
-        states, targets : equilibria so far, at least one; targets already passed are left out.
+        states, targets : equilibria so far, at least one; targets already passed are ignored.
         until_unstable : stop after the first state with negative pivots.
-        refuse_unstable : take a step that arrives at an unstable state, or far from where it was
-            expected, for a slip off a stable path (that of an imperfect specimen) and shorten it.
+        refuse_unstable : treat a step to an unstable state, or far from its prediction, as a slip
+            off the stable path (of an imperfect specimen), and repeat it with a shorter step.
         """
         step = self.options.first_step
         for target in (t for t in targets if t > states[-1].strain + 1e-12):
@@ -179,7 +179,7 @@ class PathFollower:
                 guess = displacement_at(states, strain)
                 state = self.equilibrium(strain, guess)
                 if state is None or (refuse_unstable and _is_slip(states[-1], state, guess)):
-                    self.linearisation = None  # it may be that of the state refused
+                    self.linearisation = None  # may belong to the refused state
                     step = 0.5 * (strain - here)
                     if step < SMALLEST_STEP:
                         return False
@@ -198,5 +198,5 @@ def _is_slip(before: State, state: State, guess: PETSc.Vec) -> bool:
 
 
 def displacement_at(states: Sequence[State], strain: float) -> PETSc.Vec:
-    """By the tangent of one state of a path, or the cubic through the last two."""
+    """Displacement extrapolated along one state's tangent, or the cubic through the last two."""
     return extrapolate([(s.strain, s.u, s.tangent) for s in states[-2:]], strain)

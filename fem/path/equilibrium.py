@@ -1,6 +1,6 @@
 """Total-Lagrangian equilibrium of a loaded specimen (dolfinx): forms and LDL^T factor.
 
-The nominal strain e is the only load: constrained displacements are e * d with a fixed direction d.
+The nominal strain e is the only load: constrained displacements are e d with a fixed direction d.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _QUARTERS = np.concatenate([
     for *origin, sign in ((0.0, 0.0, 1), (0.5, 0.0, 1), (0.0, 0.5, 1), (0.5, 0.5, -1))
 ])  # fmt: skip
 _AT_QUARTERS = shape_functions("T6", _QUARTERS)
-"""Nodes of the four T6 elements that divide one, in its local coordinates; shape functions there.
+"""Nodes of the four T6 elements that divide a T6, in local coordinates; its shape functions there.
 """
 
 
@@ -41,29 +41,29 @@ class EdgeCompression:
 
     half_width: float
     length: float
-    """The length that nominal strain refers to [mm]; e * length is the shortening."""
+    """Length to which nominal strain refers [mm]; e * length is the shortening."""
     edges: str = "clamped"
     """With "clamped", both components are prescribed; with "sliding", u_y is free on the loaded
-    edges but for the node nearest to mid-height, which keeps the specimen in place."""
+    edges except at the node nearest to mid-height, which fixes the specimen."""
     tilt: float = 0.0
     """Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal strain
     [rad]: -e tilt y is added to its u_x."""
     pins: tuple[tuple[float, float], ...] = ()
-    """Points (x, y) whose u_y is fixed [mm]; nodes have to be there."""
+    """Points (x, y) with fixed u_y [mm]; they must be nodes."""
 
     def __post_init__(self) -> None:
         require_edges(self.edges)
 
 
 class Structure:
-    """A meshed hyperelastic body under one loading: what its equilibrium equations need.
+    """A meshed hyperelastic body under one loading, with its equilibrium equations.
 
     Vectors are PETSc vectors over all displacement components; ``u`` includes the constrained ones.
     ``factorisations`` counts every numerical factorisation. The mesh (T6) is needed on rank 0 only.
-    ``constants`` are the material's that can be changed: all of them if ``parametric``. ``nodes``
-    are where the mesh's nodes are now, see :meth:`place` [mm]. With a ``degree`` above 2
-    displacements are polynomials of that on each element, on one rank, and given at the nodes of
-    ``shown``: its quarters; else that is the mesh itself.
+    ``constants``: the material's changeable constants, all of them if ``parametric``. ``nodes``:
+    current positions of the mesh's nodes, see :meth:`place` [mm]. With a ``degree`` above 2,
+    displacements are polynomials of this degree on each element, on one rank, given at the nodes of
+    ``shown``: the mesh with each element divided in four. Else ``shown`` is the mesh itself.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Structure:
         half, tolerance = loading.half_width, 1e-8 * loading.half_width
         on_edge = np.abs(np.abs(x[:, 0]) - half) < tolerance
         fixed_y = on_edge.copy()
-        if loading.edges != "clamped":  # of two nodes as far from mid-height, the upper one
+        if loading.edges != "clamped":  # of two nodes equally far from mid-height, the upper one
             off = np.hypot(x[:, 0] + half, x[:, 1] - tolerance)
             least = self.comm.allreduce(float(off.min(initial=np.inf)), MPI.MIN)
             fixed_y = on_edge & (off < least + 0.5 * tolerance)
@@ -109,7 +109,7 @@ class Structure:
         self._shortening, turning = self._direction.x.array.copy(), along[x[along, 0] > 0.0]
         self._direction.x.array[2 * turning] -= loading.tilt * x[turning, 1]
         dofs = 2 * along, 2 * across + 1
-        # Only the matrices use these, and there the value is of no account.
+        # Only matrices use these conditions, where their values don't matter.
         self._bcs = [
             dolfinx.fem.dirichletbc(PETSc.ScalarType(0), d.astype(np.int32), self.V.sub(axis))
             for axis, d in enumerate(dofs)
@@ -118,15 +118,15 @@ class Structure:
         self._fixed_owned = fixed[fixed < 2 * self.V.dofmap.index_map.size_local]
 
     def place(self, nodes: FloatArray) -> None:
-        """Put the mesh's nodes at ``nodes`` (n, 2) [mm]; on one rank."""
+        """Move the mesh's nodes to ``nodes`` (n, 2) [mm]; on one rank."""
         geometry = self.V.mesh.geometry
         geometry.x[:, :2] = nodes[geometry.input_global_indices]
         self.nodes = nodes
 
     def lead(self, edges: FloatArray) -> None:
-        """Have constrained components move by strain * ``edges`` (n, 2) beyond the shortening.
+        """Add strain * ``edges`` to the prescribed displacements, beyond the shortening.
 
-        Those of nodal values [mm], others are of no account; on one rank.
+        ``edges``: nodal values (n, 2) [mm]; unconstrained components are ignored; on one rank.
         """
         direction = self._direction.x
         direction.array[:] = self._shortening
@@ -145,13 +145,13 @@ class Structure:
 
     @cached_property
     def shortening(self) -> PETSc.Vec:
-        """d(constrained displacements)/d(strain) of straight edges [mm], zero elsewhere."""
+        """d(constrained displacements)/d(strain) for straight edges [mm], zero elsewhere."""
         vector, fixed = self.zero(), self._fixed_owned
         vector.array[fixed] = self._shortening[fixed]
         return vector
 
     def on_shown(self, field: FloatArray) -> FloatArray:
-        """Nodal values (n, 2) at the nodes of ``shown``, quadratic between them."""
+        """Nodal values (n, 2) interpolated quadratically to the nodes of ``shown``."""
         if self._sampled is None:
             return field
         values = np.einsum("pa,mai->mpi", _AT_QUARTERS, field[self.mesh.cells])
@@ -159,7 +159,7 @@ class Structure:
 
     @cached_property
     def _order(self) -> IntArray:
-        """Position in dolfinx's order of every component in the order of the nodes."""
+        """For each component in the order of the mesh's nodes: its position in dolfinx's order."""
         count = len(self.mesh.nodes)
         every = np.arange(2 * count, dtype=np.float64)
         numbers = dolfinx_api.gather_nodes(self._quadratic, every, count)
@@ -172,7 +172,7 @@ class Structure:
         return vector
 
     def prescribe(self, u: PETSc.Vec, strain: float) -> None:
-        """Set the constrained components of ``u`` to what the strain demands."""
+        """Set the constrained components of ``u`` to their values at ``strain``."""
         u.array[self._fixed_owned] = strain * self._direction.x.array[self._fixed_owned]
 
     def nodal(self, u: PETSc.Vec) -> FloatArray:
@@ -200,16 +200,16 @@ class Structure:
         return self.free(self.forces(u))
 
     def forces(self, u: PETSc.Vec) -> PETSc.Vec:
-        """Internal forces [N/mm], those that hold the constrained components included."""
+        """Internal forces [N/mm], including those at the constrained components."""
         return self._assemble(self._forms.forces, u)
 
     def forces_along(self, u: PETSc.Vec, direction: PETSc.Vec) -> PETSc.Vec:
-        """How internal forces change along a displacement, K(u) direction, without a matrix."""
+        """Derivative of the internal forces along a displacement, K(u) direction, matrix-free."""
         self._set(self._along, direction)
         return self._assemble(self._along_form, u)
 
     def free(self, vector: PETSc.Vec) -> PETSc.Vec:
-        """The vector itself, now zero at the constrained components."""
+        """Set the constrained components to zero in place; return the vector."""
         vector.array[self._fixed_owned] = 0.0
         return vector
 
@@ -218,16 +218,16 @@ class Structure:
         return self.free(self._assemble(self._load_form, u))
 
     def curvature(self, u: PETSc.Vec, direction: PETSc.Vec) -> float:
-        """direction . K(u) direction [N], without a matrix: cheap for a single vector."""
+        """direction . K(u) direction [N], matrix-free: cheap for a single vector."""
         return float(direction.dot(self.forces_along(u, direction)))
 
     def stiffness(self, u: PETSc.Vec) -> PETSc.Mat:
-        """Tangent stiffness at ``u`` [N/mm^2], constrained rows identity; the same object again."""
+        """Tangent stiffness at ``u`` [N/mm^2], identity in constrained rows; one reused object."""
         self._load(u)
         return dolfinx_api.assemble_matrix(self._forms.stiffness, self._bcs, 1.0, self.tangent)
 
     def factor(self, u: PETSc.Vec) -> BodyFactor:
-        """Factorise the tangent stiffness at ``u``; as the matrix, always the same object."""
+        """Factorise the tangent stiffness at ``u``; like the matrix, one reused object."""
         self.factorisations += 1
         tangent = self.stiffness(u)
         if self._factor is None:
@@ -253,7 +253,7 @@ class Structure:
         return self.reaction_of(self.forces(u), length)
 
     def reaction_of(self, forces: PETSc.Vec, length: float) -> float:
-        """The same of internal forces, or of their change: it is linear in them."""
+        """The reaction from internal forces, or its change from theirs, as it is linear."""
         return float(forces.dot(self.shortening)) / length
 
     def smallest_jacobian(self, u: PETSc.Vec) -> float:

@@ -13,17 +13,17 @@ from petsc4py import PETSc
 from modeharvest.fem import dolfinx_api
 from modeharvest.util.arrays import FloatArray, IntArray
 
-_ROOMS = (60, 200, 600)  # to try, for the pivoting of an indefinite matrix [%]
-_TOO_SMALL = (-8, -9)  # MUMPS' INFOG(1) where it was not enough
+_ROOMS = (60, 200, 600)  # extra memory to try, for pivoting of an indefinite matrix [%]
+_TOO_SMALL = (-8, -9)  # values of MUMPS' INFOG(1) if that memory was too small
 
 
 class SymmetricFactor:
     """The LDL^T factorisation of a symmetric matrix by MUMPS: solutions and inertia.
 
-    The order of elimination is found once, so the matrix' pattern must stay.
+    The elimination order is determined once, so the matrix's pattern must not change.
 
     interface : numbers of unknowns that are not eliminated; their ``schur`` complement is kept, and
-        the inertia is that of the others.
+        the inertia is that of the other unknowns.
     """
 
     def __init__(self, matrix: PETSc.Mat, interface: IntArray | None = None) -> None:
@@ -32,11 +32,11 @@ class SymmetricFactor:
         self._pc.setType(PETSc.PC.Type.CHOLESKY)
         self._pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
         self._pc.setFactorSetUpSolverType()
-        # Solved with directly: a PC would first factorise a matrix that has changed.
+        # The factor is used directly: a PC would first factorise a changed matrix.
         self._factor = self._pc.getFactorMatrix()
-        self._factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
-        self._factor.setMumpsIcntl(24, 1)  # null pivots are detected instead of divided by
-        self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
+        self._factor.setMumpsIcntl(13, 1)  # root front on one rank, so that its inertia is counted
+        self._factor.setMumpsIcntl(24, 1)  # detect null pivots instead of dividing by them
+        self._factor.setMumpsIcntl(8, 0)  # no scaling: all unknowns are of the same kind
         if interface is not None:
             self.schur = SchurComplement(self._factor, interface)
         self.update()
@@ -48,7 +48,7 @@ class SymmetricFactor:
             self._pc.setUp()
             if self._factor.getMumpsInfog(1) not in _TOO_SMALL:
                 break
-            self._matrix.stateIncrease()  # or it would be taken for factorised
+            self._matrix.stateIncrease()  # otherwise PETSc assumes it is factorised already
         if self._factor.getMumpsInfog(1) < 0:
             raise ArithmeticError(f"MUMPS failed with INFOG(1) = {self._factor.getMumpsInfog(1)}")
 
@@ -64,22 +64,22 @@ class SymmetricFactor:
         return solution
 
     def solve_block(self, rhs: PETSc.Mat) -> PETSc.Mat:
-        """The solutions for the columns of a dense matrix: a quarter of the time for each."""
+        """The solutions for the columns of a dense matrix, in a quarter of the time per column."""
         solutions = rhs.duplicate()
         self._factor.matSolve(rhs, solutions)
         return solutions
 
 
 class SubstructuredFactor:
-    """The same for a body in parts, its substructures, of which every rank has one.
+    """The LDL^T factorisation for a body in substructures, one on each rank.
 
-    Each rank eliminates the inside of its own, which takes no messages; the Schur complements add
-    up to a matrix of the interface between them, which all ranks factorise together. To solve is
-    one sweep forward through the insides, the interface, and one sweep back. Negative pivots add
-    up, too (Haynsworth, Linear Algebra Appl. 1 (1968) 73-81). Vectors and matrices of right-hand
+    Each rank eliminates the interior of its substructure without communication. The Schur
+    complements add up to a matrix of the interface, which all ranks factorise together. A solution
+    is a forward sweep through the interiors, a solution on the interface, and a backward sweep.
+    Negative pivots add up, too (Haynsworth, Linear Algebra Appl. 1 (1968) 73-81). All right-hand
     sides are those of the whole body.
 
-    matrix, V : ``dolfinx_api.create_symmetric_matrix`` of the space, assembled.
+    matrix, V : assembled matrix of ``dolfinx_api.create_symmetric_matrix``, and its space.
     """
 
     def __init__(self, matrix: PETSc.Mat, V: Any) -> None:
@@ -116,7 +116,7 @@ class SubstructuredFactor:
         self._inside.schur.solve_by(self._solve_interface)
 
     def _solve_interface(self, rhs: FloatArray) -> FloatArray:
-        """The interface's displacements from what each rank's forward sweep leaves to it."""
+        """The interface's displacements, from its right-hand side after the forward sweeps."""
         mode, insert = PETSc.ScatterMode, PETSc.InsertMode
         self._part.array[:] = rhs
         self._load.set(0.0)
@@ -138,13 +138,13 @@ class SubstructuredFactor:
         return solution
 
     def solve_block(self, rhs: PETSc.Mat) -> PETSc.Mat:
-        """The solutions for the columns of a dense matrix: less than half of the time for each."""
+        """The solutions for a dense matrix's columns, in under half of the time per column."""
         solutions = rhs.duplicate()
         solutions.getDenseArray()[:] = self._solved(rhs.getDenseArray())
         return solutions
 
     def _solved(self, rhs: FloatArray) -> FloatArray:
-        columns = np.zeros((self._size, rhs.shape[1]), order="F")  # others' nodes: loaded there
+        columns = np.zeros((self._size, rhs.shape[1]), order="F")  # 0 for nodes of other ranks
         columns[: self._own] = rhs
         local = PETSc.Mat().createDense(columns.shape, array=columns, comm=PETSc.COMM_SELF)
         solutions = self._inside.solve_block(local)
@@ -155,16 +155,16 @@ BodyFactor = SymmetricFactor | SubstructuredFactor
 
 
 def factorise(matrix: PETSc.Mat, V: Any) -> BodyFactor:
-    """The factor of a body's matrix by ``dolfinx_api.create_symmetric_matrix``, on all ranks."""
+    """The factor of a matrix of ``dolfinx_api.create_symmetric_matrix``; on all ranks."""
     alone = V.mesh.comm.size == 1
     return SymmetricFactor(matrix) if alone else SubstructuredFactor(matrix, V)
 
 
 class SchurComplement:
-    """The Schur complement in a factor, and who solves with it: by PETSc's C functions.
+    """The Schur complement in a factor, and its solver, accessed by PETSc's C functions.
 
-    petsc4py lacks them. PETSc solves with the complement between MUMPS' sweeps forward and back,
-    through the operation of the matrix that is replaced here.
+    petsc4py lacks these functions. Between MUMPS' forward and backward sweeps, PETSc solves with
+    the complement by a matrix operation, which is replaced here.
     """
 
     _FACTORED, _SOLVE = 1, 7  # MAT_FACTOR_SCHUR_FACTORED, MATOP_SOLVE
@@ -177,7 +177,7 @@ class SchurComplement:
         _petsc("MatFactorSetSchurIS", _handle(factor), _handle(numbers))
 
     def values(self) -> FloatArray:
-        """The whole matrix."""
+        """The complement as a full matrix."""
         status, pointer = ctypes.c_int(), ctypes.POINTER(ctypes.c_double)()
         matrix = ctypes.byref(self._matrix)
         _petsc("MatFactorGetSchurComplement", _handle(self._factor), matrix, ctypes.byref(status))
@@ -188,16 +188,16 @@ class SchurComplement:
         return values
 
     def solve_by(self, function: Callable[[FloatArray], FloatArray]) -> None:
-        """Let ``function`` give the solution for a right-hand side, until the next update."""
+        """Use ``function`` to solve for a right-hand side, until the next update."""
 
         def operation(_matrix: int, rhs: int, solution: int) -> int:
             try:
                 self._array(solution, "Write")[:] = function(self._array(rhs, "Read"))
-            except Exception:  # nothing may pass through C
+            except Exception:  # exceptions must not pass through C
                 return 1
             return 0
 
-        self._operation = _OPERATION(operation)  # named: PETSc doesn't keep it alive
+        self._operation = _OPERATION(operation)  # stored, as PETSc doesn't keep it alive
         _petsc("MatSetOperation", self._matrix, self._SOLVE, self._operation)
         matrix = ctypes.byref(self._matrix)
         name = "MatFactorRestoreSchurComplement"
@@ -213,7 +213,7 @@ class SchurComplement:
         return array
 
 
-_LIBRARY = ctypes.CDLL(PETSc.__file__)  # and with it PETSc itself
+_LIBRARY = ctypes.CDLL(PETSc.__file__)  # also loads PETSc itself
 _OPERATION = ctypes.CFUNCTYPE(ctypes.c_int, *3 * [ctypes.c_void_p])
 
 
@@ -228,5 +228,5 @@ def _handle(thing: PETSc.Object) -> ctypes.c_void_p:
 
 
 def _components(nodes: IntArray) -> IntArray:
-    """The numbers of both components of nodes."""
+    """The numbers of both displacement components of nodes."""
     return (2 * nodes[:, None] + [0, 1]).ravel().astype(PETSc.IntType)

@@ -1,7 +1,7 @@
-"""Newton's method to equilibrium, with as few factorisations as it takes.
+"""Newton's method for equilibrium, with as few factorisations as possible.
 
-An iteration with a factor that is there costs an eighth of a new one, so the tangent
-is kept ("chord" iterations) as long as that is the shorter way.
+An iteration with an existing factor costs an eighth of a new factorisation, so the tangent
+is kept ("chord" iterations) as long as that is faster.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from petsc4py import PETSc
 from modeharvest.fem.path.equilibrium import Structure
 from modeharvest.fem.path.factor import BodyFactor
 
-_PATIENCE = 12  # chord iterations still to come for which a new factor isn't worth its cost
+_PATIENCE = 12  # expected further chord iterations up to which a new factor doesn't pay
 _MAX_FACTORS = 8
-_SMALLEST_SHARE = 1 / 64  # of a Newton step, before giving up
+_SMALLEST_SHARE = 1 / 64  # smallest fraction of a Newton step before giving up
 _MAX_ITERATIONS = 60
-# The residual must be smaller than what a change of the nominal strain by this would make.
+# The residual must be smaller than that of a change of the nominal strain by this.
 STRAIN_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """What picks a point of the path instead of a strain: weights . (u - origin) = amplitude."""
+    """Defines a point of the path instead of a strain: weights . (u - origin) = amplitude."""
 
     weights: PETSc.Vec
     origin: PETSc.Vec
@@ -37,10 +37,10 @@ class Constraint:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """How the structure answers to small changes of an equilibrium: serves states nearby, too."""
+    """Linearised response of the structure at an equilibrium, used for nearby states, too."""
 
     factor: BodyFactor
-    """Of the tangent stiffness."""
+    """Factor of the tangent stiffness."""
     tangent: PETSc.Vec
     """du/d(strain) along the path [mm]."""
     load_size: float
@@ -54,10 +54,10 @@ def correct(
     near: Linearisation | None = None,
     constraint: Constraint | None = None,
 ) -> NewtonIteration | None:
-    """The iteration that has arrived at the equilibrium near ``guess``; None if none arrives.
+    """The converged iteration at the equilibrium near ``guess``; None if it doesn't converge.
 
-    The guess is left as it is; its constrained components are set from ``strain``, the nominal one
-    that is prescribed or, with a constraint, its own start. ``near`` is that of a state nearby.
+    ``guess`` isn't modified. Constrained components follow from ``strain``, the prescribed nominal
+    strain or, with a constraint, its initial guess. ``near``: linearisation of a nearby state.
     """
     iteration = NewtonIteration(structure, guess, strain, near, constraint)
     for _ in range(_MAX_ITERATIONS):
@@ -70,13 +70,13 @@ def correct(
 
 
 class NewtonIteration:
-    """A Newton iteration under way: where it is (``u``, ``strain``), and the step that led there.
+    """State of a Newton iteration: current ``u`` and ``strain``, and the step that led there.
 
-    ``load`` is that of ``u`` when the iteration has arrived.
+    After convergence, ``load`` is that of ``u``.
 
-    A step is assessed by the next one that the same factor would make from there, which is
-    a measure of the error in millimetres (natural monotonicity: Deuflhard, Newton Methods for
-    Nonlinear Problems, Springer 2011, section 2.1); residuals are governed by what is stiff.
+    A step is assessed by the next step with the same factor, which measures the error in mm
+    (natural monotonicity: Deuflhard, Newton Methods for Nonlinear Problems, Springer 2011,
+    section 2.1); residuals, in contrast, are dominated by stiff deformations.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class NewtonIteration:
         self.last: _NewtonStep | None = None
 
     def evaluate(self) -> None:
-        """Residual and the constraint's miss at the present state."""
+        """Compute the residual and the constraint's violation at the current state."""
         self.residual = self.structure.residual(self.u)
         self.miss = 0.0 if self.constraint is None else self.constraint.value(self.u)
         self.size = float(self.residual.norm())
@@ -111,16 +111,16 @@ class NewtonIteration:
         """Whether the residual and the constraint are within tolerance."""
         if not (self.size <= self.small and abs(self.miss) <= 1e-9):
             return False
-        self._weigh()  # the tolerance was that of a state nearby
+        self._weigh()  # the tolerance was that of a nearby state
         return self.size <= self.small
 
     def _weigh(self) -> None:
-        """The load at the present state, which says how small a residual has to be."""
+        """Compute the load at the current state, which sets the tolerance of the residual."""
         self.load = self.structure.load(self.u)
         self.small = STRAIN_TOLERANCE * float(self.load.norm())
 
     def advance(self) -> bool:
-        """Take the next step, with a new factor where that pays; False to give up."""
+        """Take the next step, with a new factor if that pays; False to give up."""
         last, step = self.last, None
         if self.factor is not None and math.isfinite(self.size):
             step = self._step(is_fresh=False)
@@ -154,12 +154,12 @@ class NewtonIteration:
         return True
 
     def _iterations_left(self, rate: float) -> float:
-        """How many more it will take if each leaves this much of the error."""
+        """Expected number of further iterations if each reduces the error by ``rate``."""
         left = max(math.log(self.size / self.small), 0.0)
         return left / -math.log(rate) if rate > 0.0 else 0.0
 
     def _step(self, is_fresh: bool) -> _NewtonStep:
-        """The Newton step with the factor at hand, along the constraint if there is one."""
+        """The Newton step with the current factor, subject to the constraint if there is one."""
         assert self.factor is not None
         step, change = self.factor.solve(self.residual), 0.0
         step.scale(-1.0)
@@ -172,7 +172,7 @@ class NewtonIteration:
 
 @dataclass(frozen=True, eq=False)
 class _NewtonStep:
-    """A step from a state, and whether the tangent there was factorised for it."""
+    """A step from a state, and whether the tangent was factorised at that state."""
 
     start: PETSc.Vec
     strain: float
@@ -184,7 +184,7 @@ class _NewtonStep:
 
 
 def path_tangent(structure: Structure, factor: BodyFactor, load: PETSc.Vec) -> PETSc.Vec:
-    """du/d(strain) along the equilibrium path [mm], constrained components included."""
+    """du/d(strain) along the equilibrium path [mm], including constrained components."""
     tangent = factor.solve(load)
     tangent.scale(-1.0)
     structure.prescribe(tangent, 1.0)

@@ -1,8 +1,8 @@
-"""Parameters of a compression test by their names: what each changes in the model, and its unit.
+"""Parameters of a compression test by name: their effect on the model, and their units.
 
-Constants of the material stand in its energy. Everything else is linear in its parameters: where
-holes are, of which a smooth map moves a mesh's nodes, and how loaded edges move. Polynomials are
-products of Legendre's: P_i(x/a) P_j(y/b) over the cellular part, P_j(y/b) along an edge.
+Constants of the material are parameters of its energy. Everything else is linear in its parameters:
+the holes' positions, from which a smooth map moves the mesh's nodes, and the loaded edges' motion.
+Polynomials are Legendre products: P_i(x/a) P_j(y/b) over the cellular part, P_j(y/b) along an edge.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 TRAVEL, TILT = "travel", "tilt"
-"""Unknowns of the loaded edges: a factor of all nominal strains [-], and the tilt of the edge at
+"""Unknowns of the loaded edges: a factor on all nominal strains [-], and the tilt of the edge at
 x > 0 per nominal strain [rad]."""
 PARTS = ("x", "y", "diameter", "oval0", "oval45")
-"""Of a hole, in the order of :func:`modeharvest.fem.meshing.hole_motion`."""
+"""Deviations of a hole, in the order of :func:`modeharvest.fem.meshing.hole_motion`."""
 _ODD = {"x": (True, False), "y": (False, True), "oval45": (True, True)}
-"""Whether a part changes its sign in mirrors x -> -x and y -> -y; others don't in either."""
+"""Whether a deviation changes its sign under x -> -x and y -> -y; the others don't."""
 _PART, _DEGREE = f"({'|'.join(PARTS)})", r"(\d+)"
 _OWN = re.compile(rf"holes\[(\d+)\]\.{_PART}")
 _SMOOTH = re.compile(rf"holes\.{_PART}\[{_DEGREE}, ?{_DEGREE}\]")
 _EDGE = re.compile(rf"(left|right)\.(x|y)\[{_DEGREE}\]")
 _AMPLITUDE = re.compile(r"amplitude\[(\d+)\]")
 HIGHEST = 6
-"""Degree of a polynomial."""
+"""Highest degree of a polynomial."""
 _OPEN = 0.5
-"""Share of half a ligament that a hole's edge may move: with more the map of the mesh folds."""
+"""Largest motion of a hole's edge, over half a ligament; above it the map of the mesh folds."""
 
 
 @dataclass(frozen=True)
 class EdgeMotion:
-    """How a loaded edge moves by a unit of a parameter and of nominal strain: a polynomial."""
+    """Polynomial motion of a loaded edge per unit of a parameter and of nominal strain."""
 
     side: int
     """-1 for the edge at x < 0, 1 for that at x > 0."""
@@ -48,7 +48,7 @@ class EdgeMotion:
     factor: float = 1.0
 
     def at(self, nodes: FloatArray, spec: Specimen) -> FloatArray:
-        """(n, 2) displacement of nodes (n, 2) per nominal strain [mm per unit]; 0 off the edge."""
+        """(n, 2) displacement of nodes (n, 2) per nominal strain [mm per unit]; else 0."""
         half, found = spec.half_size, np.zeros_like(nodes)
         there = np.abs(nodes[:, 0] - self.side * half[0]) < 1e-8 * half[0]
         profile = Legendre.basis(self.degree)(nodes[there, 1] / half[1])
@@ -58,28 +58,28 @@ class EdgeMotion:
 
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """What a parameter of a test changes, per unit of it."""
+    """Changes of a test's model per unit of a parameter."""
 
     unit: str
     constant: str = ""
-    """Of the material, by its name."""
+    """Name of the material's constant."""
     holes: FloatArray | None = None
-    """(holes, 5) in the order of PARTS [mm per unit]."""
+    """(holes, 5) deviations of the holes, in the order of PARTS [mm per unit]."""
     edge: EdgeMotion | None = None
     is_symmetric: bool = True
-    """Whether holes stay mirror images of each other about both axes; of edges, about the x axis,
-    under which the pattern of an even number of rows changes its sign: the test still buckles at a
-    bifurcation, whose strain answers."""
+    """Whether the symmetry needed for a bifurcation is kept: for holes about both axes, for edges
+    about the x axis, under which the pattern of an even number of rows changes its sign. The test
+    then still buckles at a bifurcation, whose strain depends on the parameter."""
 
 
 def parameter(name: str, experiment: Experiment, others: Sequence[str] = ()) -> Parameter:
-    """What a name stands for.
+    """The parameter with a given name.
 
-    "kappa", "moduli[0]" and so on, as the material calls its constants; TRAVEL, TILT;
-    "amplitude[k]", of the pattern in the state number k; "holes.x[i,j]", "holes.diameter[i,j]" and
-    so on, see PARTS, of all holes by a polynomial, "holes[k].x" and so on of the hole number k
-    alone, in the order of ``Specimen.hole_centres``; "right.x[j]", "left.y[j]" and so on of the
-    loaded edges. InputError if the test has no such parameter; ``others`` would do as well.
+    Names are: constants of the material, such as "kappa", "moduli[0]"; TRAVEL, TILT;
+    "amplitude[k]", of the pattern in state number k; "holes.x[i,j]", "holes.diameter[i,j]" etc.
+    (see PARTS), polynomials over all holes; "holes[k].x" etc., of hole number k alone, in the order
+    of ``Specimen.hole_centres``; "right.x[j]", "left.y[j]" etc., of the loaded edges. InputError if
+    the test has no such parameter; ``others``: further valid names, for the message.
     """
     spec = experiment.specimen
     if name in (known := list(_constants(experiment))):
@@ -129,7 +129,7 @@ def _constants(experiment: Experiment) -> Iterator[str]:
 
 
 def require_number(name: str, what: str, number: int, count: int) -> None:
-    """InputError unless a number in an unknown's name is from 0 to one less than so many."""
+    """Raise InputError unless a number in an unknown's name is 0 ... count - 1."""
     if number >= count:
         raise InputError(f"unknowns: expected {what} from 0 to {count - 1} in {name}, got {number}")
 
@@ -137,7 +137,7 @@ def require_number(name: str, what: str, number: int, count: int) -> None:
 def holes_of(
     names: Sequence[str], values: Sequence[float] | FloatArray, experiment: Experiment
 ) -> FloatArray:
-    """(holes, 5) by how much holes are off the specimen's, by parameters [mm]."""
+    """(holes, 5) deviations of holes from the specimen's, due to parameters [mm]."""
     parts = [parameter(name, experiment).holes for name in names]
     total = np.zeros((len(experiment.specimen.hole_centres), len(PARTS)))
     for value, part in zip(values, parts, strict=True):
@@ -146,7 +146,7 @@ def holes_of(
 
 
 def require_open(specimen: Specimen, holes: FloatArray) -> None:
-    """InputError if holes are off by so much that they come near their neighbours'."""
+    """Raise InputError if deviations of holes are so large that they get close to neighbours."""
     growth = np.abs(holes[:, 2]) + np.linalg.norm(holes[:, 3:], axis=1)
     moved = np.linalg.norm(holes[:, :2], axis=1) + 0.5 * growth
     share = moved / (0.5 * (specimen.largest_diameter - specimen.diameters))

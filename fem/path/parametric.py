@@ -1,12 +1,12 @@
 """A compression test whose material and supports are parameters: its states and sensitivities.
 
-Forms are compiled once, with the parameters as constants. The states of a set of parameters are
-found along the whole path, from the undeformed specimen through its critical point to the branch
-that is asked for. What breaks the specimen's mirror symmetry comes last (a tilt, holes of their
-own): at each state of the specimen without it, brought in while the strain is kept, which stays on
-the branch of that name where the natural path would lead to whichever branch it favours. States of
-parameters nearby follow from these at a fraction of the cost: the sensitivities predict them,
-Newton's method corrects, and the inertia says that they are still stable.
+Forms are compiled once, with the parameters as constants. The states for given parameters are
+found along the whole path, from the undeformed specimen through its critical point to the requested
+branch. Parameters that break the mirror symmetry (tilt, individual holes) are applied last: at each
+state of the symmetric specimen they are increased at constant strain, which stays on the named
+branch, whereas the natural path would lead to the branch that it favours. States for nearby
+parameters follow from these at a fraction of the cost: sensitivities predict them, Newton's method
+corrects, and the inertia confirms their stability.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _SIGNS = {"buckled+": 1, "buckled-": -1}
-_SHORTEST = 1 / 64  # of what breaks the symmetry, or of an amplitude, in one step
-_NO_PATTERN = 1e-6  # overlap of a mode with the pattern [-], or its amplitude [mm]
-_AHEAD, _BEYOND = 1.02, 2.0  # times the last strain: how far to look for a critical point
-_ATTEMPTS = 3  # with shorter and shorter steps
+_SHORTEST = 1 / 64  # smallest step, as a fraction of the asymmetry or of an amplitude
+_NO_PATTERN = 1e-6  # overlap of a mode with the pattern [-], or amplitude [mm], that counts as 0
+_AHEAD, _BEYOND = 1.02, 2.0  # times the last strain: range of the search for a critical point
+_ATTEMPTS = 3  # each with shorter steps
 _OFF, _JUMP = 0.5, 0.05
-"""Most by which a state may be off its prediction: of the step to that, or of all its u."""
-_BELOW = 1.0 - 1e-6  # of the displacement at a critical point: so near, derivatives are its own
-_KEPT = 0.3  # of a buckled state's pattern, at least, in one step
+"""Largest deviation of a state from its prediction, over the predicted step, or over all of u."""
+_BELOW = 1.0 - 1e-6  # factor on a critical point's u: so close, derivatives are the same
+_KEPT = 0.3  # least fraction of a buckled state's pattern that remains after one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,28 +56,28 @@ class ParametricState:
     """An equilibrium state of a test, and its derivatives by the test's ``names``."""
 
     strain: float
-    """Nominal [-]: that of the test, or what the amplitude makes it, over the travel."""
+    """Nominal strain over ``travel`` [-]: that of the test, or as given by the amplitude."""
     mesh: Mesh
-    """The undeformed one, with its holes where the parameters put them."""
+    """The undeformed mesh, with the holes' positions according to the parameters."""
     displacement: FloatArray
-    """(n, 2) of the mesh's nodes [mm]."""
+    """(n, 2) displacement of the mesh's nodes [mm]."""
     force: float
-    """Compressive, by thickness [N/mm]."""
+    """Compressive force per unit thickness [N/mm]."""
     negative_pivots: int
     branch: str
     displacement_by: FloatArray
     nodes_by: FloatArray
-    """(k, n, 2) of the nodes' displacements, and where nodes go themselves [mm per unit]."""
+    """(k, n, 2) derivatives of the nodes' displacements and of their positions [mm per unit]."""
     force_by: FloatArray
-    """(k,) [N/mm per unit]."""
+    """(k,) derivatives of the force [N/mm per unit]."""
     strain_by: FloatArray
-    """(k,) [1 per unit]."""
+    """(k,) derivatives of the strain [1 per unit]."""
     amplitude: float = 0.0
-    """Of the pattern: the displacement's projection on it [mm]."""
+    """Amplitude of the pattern: the displacement's projection on it [mm]."""
 
 
 class _Known(NamedTuple):
-    """A state found, its internal forces, and its derivatives by the unknowns if wanted."""
+    """A known state, its internal forces, and its derivatives by the unknowns if requested."""
 
     state: State
     branch: str
@@ -88,13 +88,13 @@ class _Known(NamedTuple):
 class ParametricTest:
     """The states of a virtual test at its strains, for any values of its unknown parameters.
 
-    experiment : with the values of everything that isn't unknown; of its branches the first counts.
-    names : of the unknowns, see :func:`modeharvest.fem.path.parameters.parameter`. With
-        "amplitude[k]" the state number k is found by the pattern's amplitude [mm] instead of its
+    experiment : values of everything that isn't unknown; only its first branch is used.
+    names : names of the unknowns, see :func:`modeharvest.fem.path.parameters.parameter`. With
+        "amplitude[k]" state number k is defined by the pattern's amplitude [mm] instead of its
         nominal strain.
-    mesh : T6, of the specimen.
-    degree : of the displacement's polynomials over an element. With one above 2 the states are
-        given on another ``mesh``, that of its quarters.
+    mesh : T6 mesh of the specimen.
+    degree : polynomial degree of the displacement over an element. Above 2 the states are given
+        on another ``mesh``, with every element divided into four.
     """
 
     def __init__(
@@ -123,32 +123,32 @@ class ParametricTest:
     def meshed(
         cls, experiment: Experiment, names: Sequence[str], degree: int = 3
     ) -> ParametricTest:
-        """A test on a mesh of the experiment's own size, its holes scattered as they are there."""
+        """A test on a mesh of the experiment's element size, with its scatter of the holes."""
         spec = experiment.specimen
         mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
         return cls(experiment, names, mesh, degree)
 
     @property
     def critical_strain(self) -> float | None:
-        """Of the last values whose path was followed, if there is a bifurcation [-]."""
+        """Critical strain for the last values whose path was followed; None if none [-]."""
         return None if self._critical is None else self._critical.strain
 
     @property
     def own_values(self) -> FloatArray:
-        """(k,) values of the parameters in the experiment: of its material, 1 of a travel."""
+        """(k,) values of the parameters in the experiment: material constants; 1 for travel."""
         known = {name: float(c.value) for name, c in self.structure.constants.items()}
         known |= {TRAVEL: 1.0, TILT: self.experiment.tilt}
         return np.array([known.get(name, 0.0) for name in self.names])
 
     @property
     def unknowns(self) -> int:
-        """How many displacements are sought."""
+        """Number of displacement unknowns."""
         return int(self._weights.size)
 
     def at(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
-        """The states for values of the unknowns (k,), in the order of ``names``.
+        """The states for values (k,) of the unknowns, in the order of ``names``.
 
-        InputError if the path does not reach one of them.
+        InputError if the path doesn't reach one of the states.
         """
         first, late, travel, amplitudes = self._given(values)
         self._vary(first)
@@ -161,10 +161,10 @@ class ParametricTest:
         return self._results(values, known)
 
     def near(self, values: FloatArray, with_derivatives: bool = True) -> list[ParametricState]:
-        """The same, in one step from the states found last where that leads to their branches.
+        """The states as from :meth:`at`, if possible in one step from the states found last.
 
-        Where it leads to no equilibrium, to an unstable one, far from what was predicted or out of
-        the pattern, and where there are no states yet, the whole path is followed.
+        The whole path is followed without such states, or if the step leads to no equilibrium, to
+        an unstable one, to one far from its prediction, or to one without the pattern.
         """
         if self._last is None:
             return self.at(values, with_derivatives)
@@ -202,15 +202,15 @@ class ParametricTest:
         return self._results(values, known)
 
     def critical_state(self, values: FloatArray) -> ParametricState | None:
-        """The bifurcation and its derivatives, of the values whose states were found last, or None.
+        """The bifurcation and its derivatives for the last values whose states were found, or None.
 
-        What breaks the symmetry counts to the first order: not a tilt, but the holes' mean.
+        Asymmetric parameters act to first order: a tilt doesn't, the holes' mean deviation does.
         """
         if (point := self._critical) is None:
             return None
         first, _, travel, _ = self._given(values)
         self._vary(first)
-        factor = self.structure.factor(_BELOW * point.u)  # at it the tangent is singular
+        factor = self.structure.factor(_BELOW * point.u)  # at the point the tangent is singular
         tangent = path_tangent(self.structure, factor, self.structure.load(point.u))
         state = State(point.strain, point.u, tangent, 0)
         forces = self.structure.forces(state.u)
@@ -220,7 +220,7 @@ class ParametricTest:
         return replace(found, strain=found.strain + float(found.strain_by @ (late * values)))
 
     def _results(self, values: FloatArray, known: list[_Known]) -> list[ParametricState]:
-        """The states found last, and the critical one where it is wanted."""
+        """The states found last, and the critical state if requested."""
         self._last = np.array(values), known
         _, late, travel, _ = found = self._given(values)
         self._vary(found[0], 1.0, late)
@@ -231,7 +231,7 @@ class ParametricTest:
     def _given(
         self, values: FloatArray
     ) -> tuple[Variation, Variation, float, dict[int, float | None]]:
-        """What keeps the symmetry and what breaks it, travel and amplitudes; constants are set."""
+        """Symmetric and asymmetric variation, travel, amplitudes; sets the material's constants."""
         given = dict(zip(self.names, map(float, values), strict=True))
         for name, constant in self.structure.constants.items():
             constant.value = given.get(name, float(constant.value))
@@ -245,12 +245,12 @@ class ParametricTest:
 
     @property
     def _factor(self) -> BodyFactor | None:
-        """Of the equilibrium found last."""
+        """Factor of the tangent stiffness at the equilibrium found last."""
         near = self._follower.linearisation
         return None if near is None else near.factor
 
     def omitted_terms(self, values: FloatArray) -> list[ParametricState]:
-        """The states, with derivatives by OMITTED constants of the law alone."""
+        """The states, with derivatives by the OMITTED constants of the law only."""
         k, law = len(values), with_omitted_terms(self.experiment.material)
         wider = replace(self.experiment, material=law)
         test = ParametricTest.meshed(wider, [*self.names, *OMITTED], self._degree)
@@ -262,7 +262,7 @@ class ParametricTest:
         ]  # fmt: skip
 
     def _variation(self, name: str) -> Variation:
-        """How the structure changes with a parameter."""
+        """The change of the structure with a parameter."""
         found, spec, nodes = self._parameters[name], self.experiment.specimen, self._nodes
         zero = np.zeros_like(nodes)
         moved = zero if found.holes is None else hole_motion(nodes, spec, found.holes)
@@ -270,7 +270,7 @@ class ParametricTest:
         return Variation(moved, edges, found.constant)
 
     def _sum(self, values: Mapping[str, float], names: Iterable[str]) -> Variation:
-        """What some of the parameters make of nodes and edges together."""
+        """The sum of the changes of nodes and edges due to some of the parameters."""
         nodes, edges = np.zeros_like(self._nodes), np.zeros_like(self._nodes)
         for name in names:
             nodes += values[name] * self._variations[name].nodes
@@ -278,7 +278,7 @@ class ParametricTest:
         return Variation(nodes, edges)
 
     def _vary(self, first: Variation, share: float = 0.0, late: Variation | None = None) -> None:
-        """Have the structure with one variation and a share of another."""
+        """Apply one variation and a fraction ``share`` of another to the structure."""
         late = late or first
         self.structure.place(self._nodes + first.nodes + share * late.nodes)
         self.structure.lead(first.edges + share * late.edges)
@@ -289,7 +289,7 @@ class ParametricTest:
         strains = [travel * e for e in self.experiment.strains]
         by_strain = [e for k, e in enumerate(strains) if amplitudes[k] is None]
         name = self.experiment.branches[0]
-        # A branch of a given amplitude may begin beyond the strains of these parameters.
+        # A branch with a given amplitude may start beyond the strains for these parameters.
         most = _BEYOND if len(by_strain) < len(strains) or self.with_critical else _AHEAD
         most *= max(strains)
         path, critical = self._primary(most, by_strain, name)
@@ -322,7 +322,7 @@ class ParametricTest:
     def _primary(
         self, largest: float, strains: Sequence[float], name: str
     ) -> tuple[list[State], Critical | None]:
-        """The primary path through the strains until it becomes unstable, and where that is."""
+        """The primary path through the strains until it is unstable, and its critical point."""
         follower, options = self._follower, self.experiment.path
         follower.options, follower.linearisation, follower.modes = options, None, []
         path, targets = [follower.start()], sorted({*strains, largest})
@@ -343,7 +343,7 @@ class ParametricTest:
         return path, None
 
     def _of_branch(self, critical: Critical, name: str) -> Critical:
-        """The critical point with its mode turned to the branch of that name, as simulated ones."""
+        """The critical point, its mode with the sign of the named branch, as in simulations."""
         mode, spec = critical.modes[0], self.experiment.specimen
         share = self._share(mode.vector)
         if spec.is_staggered or abs(share) < _NO_PATTERN:
@@ -357,7 +357,7 @@ class ParametricTest:
         return float(self._weights.dot(mode)) * self._norm
 
     def _at_amplitude(self, critical: Critical, target: float) -> State | None:
-        """The state of the branch where the pattern has an amplitude [mm]."""
+        """The state of the branch at which the pattern has a given amplitude [mm]."""
         follower, weights = self._follower, self._weights
         mode = critical.modes[0].vector
         if abs(self._share(mode)) < _NO_PATTERN:
@@ -390,7 +390,7 @@ class ParametricTest:
     def _bent(
         self, state: State, first: Variation, late: Variation, weights: PETSc.Vec | None
     ) -> State:
-        """The state of the same strain or amplitude with what breaks the symmetry, in steps."""
+        """The state at the same strain or amplitude with the asymmetric variation, in steps."""
         structure, follower = self.structure, self._follower
         length, constraint, reached, step = self.experiment.specimen.length, None, 0.0, 1.0
         if weights is not None:
@@ -404,7 +404,7 @@ class ParametricTest:
             self._vary(first, aim, late)
             follower.linearisation = None
             found = follower.equilibrium(strain, guess, constraint, with_modes=False)
-            # A small amplitude that the tilt works against is that of an unstable state.
+            # With a prescribed small amplitude opposed by the tilt, the state is unstable.
             is_slip = constraint is None and found and found.negative_pivots > state.negative_pivots
             if found is None or is_slip:
                 step *= 0.5
@@ -423,7 +423,7 @@ class ParametricTest:
         self, state: State, branch: str, number: int, travel: float, weights: PETSc.Vec | None,
         factor: BodyFactor | None, with_derivatives: bool,
     ) -> _Known:  # fmt: skip
-        """What is kept of a state, its internal forces and its derivatives if wanted."""
+        """A state with its internal forces, and with its derivatives if requested."""
         forces = self.structure.forces(state.u)
         how = number, travel, forces, weights, factor
         return _Known(state, branch, forces, self._by(state, *how) if with_derivatives else ())
@@ -432,7 +432,7 @@ class ParametricTest:
         self, state: State, number: int, travel: float, forces: PETSc.Vec,
         weights: PETSc.Vec | None, factor: BodyFactor | None, mode: Mode | None = None,
     ) -> list[Sensitivity]:  # fmt: skip
-        """Derivatives by all unknowns: zero by amplitudes of other states."""
+        """Derivatives by all unknowns; zero for amplitudes of other states."""
         structure, length = self.structure, self.experiment.specimen.length
         own = [n for n in self.names if not n.startswith("amplitude")]
         variations = [None if n == TRAVEL else self._variations[n] for n in own]

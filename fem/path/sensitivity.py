@@ -1,12 +1,12 @@
 """Sensitivities of an equilibrium to a test's parameters: of material, loaded edges and holes.
 
-At an equilibrium R(u, p) = 0, so du/dp = -K^-1 dR/dp: with the factor that is there anyway, one
-back-substitution a parameter, all at once. dR/dp is taken by differences in p, exact to
-rounding in moduli, on which R depends linearly; where holes move, on a mesh whose nodes have moved.
-Near a bifurcation K is nearly singular; where the amplitude of the pattern is prescribed instead,
-the nominal strain follows from it, and both answer regularly to p: the bordered system, solved by
-block elimination (Keller, in: Applications of Bifurcation Theory, Academic Press 1977, pp.
-359-384). At it the strain follows from the mode's curvature; what drives the mode is left out.
+At an equilibrium R(u, p) = 0, so du/dp = -K^-1 dR/dp: with the existing factor this is one
+back-substitution per parameter, for all at once. dR/dp is computed by finite differences in p,
+exact to rounding for moduli, on which R depends linearly; for holes on a mesh with moved nodes.
+Near a bifurcation K is nearly singular. If the pattern's amplitude is prescribed instead of the
+nominal strain, both u and the strain depend regularly on p: this bordered system is solved by block
+elimination (Keller, in: Applications of Bifurcation Theory, Academic Press 1977, pp. 359-384). At
+the bifurcation, the strain follows from the mode's curvature; forces on the mode are left out.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from modeharvest.fem.path.factor import BodyFactor
 from modeharvest.fem.path.stability import Mode
 from modeharvest.util.arrays import FloatArray
 
-_STEP = 1e-4  # of a constant, for differences
-_STEP_MM = 3e-5  # of the largest motion of a node
-_AHEAD = 1e-3  # of these, where differences are of one side: errors below 1e-6 still
-_ALONG = 1e-5  # of strain, along a path
+_STEP = 1e-4  # relative step of a constant, for finite differences
+_STEP_MM = 3e-5  # step as the largest motion of a node [mm]
+_AHEAD = 1e-3  # factor on these steps for one-sided differences: errors are still below 1e-6
+_ALONG = 1e-5  # step of strain along a path
 OMITTED = ("omitted[0]", "omitted[1]", "omitted[2]")
 
 
 @dataclass(frozen=True, eq=False)
 class Variation:
-    """How a structure changes with a parameter, per unit of it."""
+    """Change of a structure per unit of a parameter."""
 
     nodes: FloatArray
-    """(n, 2) where nodes move [mm]."""
+    """(n, 2) motion of nodes [mm]."""
     edges: FloatArray
-    """(n, 2) what is added to the displacements of the loaded edges per nominal strain [mm]."""
+    """(n, 2) additional displacement of the loaded edges per nominal strain [mm]."""
     constant: str = ""
-    """Or which of the material's changes, as in ``Structure.constants``."""
+    """Name of the material's constant that changes, as in ``Structure.constants``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +50,11 @@ class Sensitivity:
     """Derivatives by one parameter."""
 
     displacement: PETSc.Vec
-    """Of u at nodes that move with it [mm per unit of the parameter], constrained ones included."""
+    """Derivative of u at moving nodes, including constrained components [mm per unit]."""
     force: float
-    """Of the reaction by thickness [N/mm per unit]."""
+    """Derivative of the reaction per unit thickness [N/mm per unit]."""
     strain: float
-    """Of the nominal strain [-]."""
+    """Derivative of the nominal strain [1 per unit]."""
 
 
 def sensitivities(
@@ -64,14 +64,14 @@ def sensitivities(
 ) -> list[Sensitivity]:  # fmt: skip
     """Derivatives of an equilibrium by parameters; one factorisation, one block of solutions.
 
-    structure, state : parametric; its equilibrium, whose constants, edges and nodes it has.
-    variations : of each parameter; None for a factor of all nominal strains.
-    length : of the reaction, see :meth:`Structure.reaction` [mm].
-    weights : of the amplitude that is prescribed, weights . u; by default the strain is.
-    travel : the factor that the state's strain has in it.
-    factor : of the tangent stiffness at the state, if it is at hand.
-    mode : the critical one of a bifurcation: the strain keeps its curvature zero; see above.
-    forces : internal ones at the state, if they are at hand.
+    structure, state : parametric structure, with constants, edges and nodes of the equilibrium.
+    variations : one for each parameter; None for a factor on all nominal strains (travel).
+    length : length for the reaction, see :meth:`Structure.reaction` [mm].
+    weights : of the prescribed amplitude, weights . u; by default the strain is prescribed.
+    travel : the factor ``travel`` included in the state's strain.
+    factor : factor of the tangent stiffness at the state, if available.
+    mode : critical mode of a bifurcation: the strain keeps its curvature zero; see above.
+    forces : internal forces at the state, if available.
     """
     factor, tangent = factor or structure.factor(state.u), state.tangent
     along = structure.forces_along(state.u, structure.shortening)  # and K is symmetric
@@ -82,7 +82,7 @@ def sensitivities(
     found = list[Sensitivity]()
     softening = 1.0 if mode is None else _curvature_rate(structure, state, mode, tangent, None)
     for variation in variations:
-        if variation is None:  # of no account where the amplitude says what the strain is
+        if variation is None:  # no effect if the amplitude determines the strain
             strain = state.strain / travel if weights is None and mode is None else 0.0
             du, force = strain * tangent, strain * float(along.dot(tangent)) / length
         else:
@@ -103,7 +103,7 @@ def sensitivities(
 def _curvature_rate(
     structure: Structure, state: State, mode: Mode, rate: PETSc.Vec, variation: Variation | None
 ) -> float:
-    """d(mode . K mode) by a parameter, or by the strain, with which u changes at a rate [N]."""
+    """d(mode . K mode) by a parameter, or by the strain; ``rate``: du by the same [N]."""
     step = _ALONG if variation is None else _step(structure, state, variation)
     return float(_difference(structure, variation, step, lambda by: structure.curvature(
         state.u + by * rate, mode.vector)))  # fmt: skip
@@ -112,7 +112,7 @@ def _curvature_rate(
 def amplitude_sensitivity(
     structure: Structure, state: State, length: float, weights: PETSc.Vec
 ) -> Sensitivity:
-    """Derivatives of an equilibrium by the amplitude ``weights . u`` that is prescribed [1/mm]."""
+    """Derivatives of an equilibrium by the prescribed amplitude ``weights . u`` [1/mm]."""
     strain = 1.0 / float(weights.dot(state.tangent))
     du = strain * state.tangent
     forces = structure.forces_along(state.u, du)
@@ -122,7 +122,7 @@ def amplitude_sensitivity(
 def _solutions(
     structure: Structure, factor: BodyFactor, forces: Sequence[PETSc.Vec], mode: Mode | None
 ) -> list[PETSc.Vec]:
-    """-K^-1 times each of some forces [mm], zero at the constrained components; without a mode."""
+    """-K^-1 times each force [mm], zero at constrained components, M-orthogonal to ``mode``."""
     if not forces:
         return []
     rows = np.array([structure.free(vector.copy()).array for vector in forces])
@@ -150,7 +150,7 @@ def _change_of_forces(
 
 
 def _step(structure: Structure, state: State, variation: Variation) -> float:
-    """Of a parameter, for differences."""
+    """Step of a parameter for finite differences."""
     if constant := structure.constants.get(variation.constant):
         return _STEP * (abs(float(constant.value)) or 1.0)
     moved = variation.nodes, state.strain * variation.edges
@@ -161,7 +161,7 @@ def _difference(
     structure: Structure, variation: Variation | None, step: float,
     function: Callable[[float], Any], here: Any = None,
 ) -> Any:  # fmt: skip
-    """Difference by a parameter of a function of its change: central, or from ``here`` without."""
+    """Difference quotient of a function of the parameter's change; one-sided with ``here``."""
     constant = None if variation is None else structure.constants.get(variation.constant)
     nodes, found = structure.nodes, []
     value = 0.0 if constant is None else float(constant.value)
@@ -177,10 +177,10 @@ def _difference(
 
 
 def with_omitted_terms(material: Material) -> Material:
-    """The same law with OMITTED constants of 0, factors of terms that its energy may lack [MPa].
+    """The law with additional constants OMITTED, 0, for terms that its energy may lack [MPa].
 
-    E^2, E (J - 1) and (J - 1)^3 with E = I1 - 3 - 2 ln J: the lowest isotropic ones that have
-    neither stress nor stiffness at rest.
+    The terms are E^2, E (J - 1) and (J - 1)^3 with E = I1 - 3 - 2 ln J: the lowest isotropic terms
+    with neither stress nor stiffness at rest.
     """
     kind = type(material)
 

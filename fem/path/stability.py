@@ -1,8 +1,8 @@
 """The stability of an equilibrium: eigenpairs of the tangent stiffness nearest to zero.
 
-Stability itself is read from the inertia of the LDL^T factor
-(``BodyFactor.negative_pivots``), which can't miss a mode. The eigenpairs, by Lanczos' method
-in blocks, say which mode it is and how far from zero.
+Stability itself follows from the inertia of the LDL^T factor
+(``BodyFactor.negative_pivots``), which can't miss a mode. The eigenpairs, computed by a block
+Lanczos method, give the mode and the distance of its eigenvalue from zero.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from petsc4py import PETSc
 from modeharvest.fem.path.factor import BodyFactor
 from modeharvest.util.arrays import FloatArray
 
-_NOISE = 1  # vectors at random in a start: the modes given may lack a symmetry
-_MOST_NEGATIVE = 24  # of the modes that are computed
+_NOISE = 1  # number of random start vectors: the given modes may lack a symmetry
+_MOST_NEGATIVE = 24  # largest number of negative modes computed
 _LARGEST_SPACE = 60  # in blocks
 _ROOM = 48  # in vectors, at first
 _LITTLE, _DEPENDENT = 1e-4, 1e-12  # eigenvalues of a normalised Gram matrix: small, zero
@@ -36,7 +36,7 @@ class Mode:
     """M x, so that overlaps with other vectors are dot products."""
 
     def overlap(self, other: PETSc.Vec) -> float:
-        """x . M other; its size is at most 1 if ``other`` is normalised likewise."""
+        """x . M other; its absolute value is at most 1 if ``other`` is normalised likewise."""
         return float(self.weighted.dot(other))
 
     def reversed(self) -> Mode:
@@ -53,13 +53,13 @@ def lowest_modes(
 ) -> list[Mode]:
     """The lowest modes, by ascending eigenvalue: all negative ones, and at least one positive.
 
-    Lanczos' method in blocks with the inverse of the stiffness, whose factor is there already. The
-    inertia is the number of negative eigenvalues to be found; of more than 24 the nearest to zero.
+    Block Lanczos method with the inverse of the stiffness, whose factor is available. The inertia
+    gives the number of negative eigenvalues to find; of more than 24, those nearest to zero.
 
-    factor, mass : of the tangent stiffness; mass matrix, its rows 0 at constrained components.
-    count, near : number of modes, more are returned if more are negative; those of a state nearby.
-    tolerance : by which a mode may be mixed with others, for that with the largest eigenvalue; less
-        for those nearer to zero. Relative errors of eigenvalues go with its square.
+    factor, mass : factor of the tangent stiffness; mass matrix, rows 0 at constrained components.
+    count, near : number of modes (more if more are negative); modes of a nearby state.
+    tolerance : largest admixture of other modes, for the mode with the largest eigenvalue; smaller
+        for those nearer to zero. Relative errors of eigenvalues are proportional to its square.
     """
     negative = min(factor.negative_pivots, _MOST_NEGATIVE)
     positive = max(count - negative, 1)
@@ -84,11 +84,11 @@ def lowest_modes(
 
 
 class _Krylov:
-    """A space that grows by blocks of K^-1 M times the last.
+    """A Krylov space, extended by blocks of K^-1 M times the last block.
 
-    Vectors are rows, of which every rank has its columns: ``vectors`` (k, n) are M-orthonormal,
-    ``images`` are M times them, ``projected`` (k, k) is K^-1 M within the space, and ``rest``
-    says by which combinations of the vectors to come K^-1 M leads out of it.
+    Vectors are rows, distributed by columns over the ranks: ``vectors`` (k, n) are M-orthonormal,
+    ``images`` are M times them, ``projected`` (k, k) is K^-1 M within the space, and ``rest``: the
+    part of K^-1 M that leads out of it, as combinations of the next block's vectors.
     """
 
     def __init__(self, factor: BodyFactor, mass: PETSc.Mat, start: FloatArray) -> None:
@@ -108,11 +108,11 @@ class _Krylov:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether K^-1 M does not lead out of the space any more."""
+        """Whether the space is invariant under K^-1 M."""
         return len(self._next[0]) == 0
 
     def grow(self) -> None:
-        """Take the next block in, and make the one to come."""
+        """Add the next block to the space, and compute the following one."""
         old, new = len(self.projected), len(self.projected) + len(self._next[0])
         while new > self._rows.shape[1]:
             self._rows = np.concatenate([self._rows, np.empty_like(self._rows)], axis=1)
@@ -126,11 +126,11 @@ class _Krylov:
         self.rest = self._products(self._next[1], ahead)
 
     def _orthonormal(self, block: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """An M-orthonormal basis of a block that the space lacks, and M times it.
+        """M-orthonormal basis of a block already orthogonal to the space, and M times it.
 
-        Where little of some vectors remains it is mostly rounding: what it has of the space is
-        taken out, and the basis made anew (Stathopoulos & Wu, SIAM J. Sci. Comput. 23 (2002)
-        2165-2182).
+        If little of some vectors remains, it is mostly rounding: the block is orthogonalised
+        again against the space, and normalised anew (Stathopoulos & Wu, SIAM J. Sci. Comput. 23
+        (2002) 2165-2182).
         """
         block, image, kept = self._normalised(block, self._applied(self._mass.matMult, block))
         if kept < _LITTLE:
@@ -142,7 +142,7 @@ class _Krylov:
     def _normalised(
         self, block: FloatArray, image: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Orthonormal combinations, dependent vectors left out, and the least Gram eigenvalue."""
+        """Orthonormal combinations, without dependent vectors, and the least Gram eigenvalue."""
         gram = self._products(block, image)
         size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         squares, turn = np.linalg.eigh(gram / np.outer(size, size))
@@ -151,21 +151,21 @@ class _Krylov:
         return change @ block, change @ image, float(squares[0])
 
     def _applied(self, operator: Callable[[PETSc.Mat], PETSc.Mat], block: FloatArray) -> FloatArray:
-        """A linear operator on the vectors of a block."""
+        """Apply a linear operator to the vectors of a block."""
         size = (self._mass.getSizes()[0], (PETSc.DECIDE, len(block)))
         columns = PETSc.Mat().createDense(size, array=block.T, comm=self._mass.comm)
         result = operator(columns)  # named, because its array doesn't keep it alive
         return np.array(result.getDenseArray().T)
 
     def _products(self, left: FloatArray, right: FloatArray) -> FloatArray:
-        """All inner products of two sets of vectors, over all ranks."""
+        """All inner products of two sets of vectors, summed over all ranks."""
         products = left @ right.T
         self._comm.Allreduce(MPI.IN_PLACE, products)
         return np.asarray(products)
 
 
 def _start(mass: PETSc.Mat, count: int, near: Sequence[Mode]) -> FloatArray:
-    """The modes given and vectors at random, zero at the constrained components."""
+    """The given modes and random vectors, zero at the constrained components."""
     free = mass.getDiagonal().array != 0
     width = _NOISE if near else count
     noise = np.random.default_rng(mass.comm.rank).standard_normal((width, len(free)))

@@ -1,9 +1,9 @@
 """Optical distortion from photographs of a speckled flat target that a stage has shifted.
 
-A distortion S makes a rigid shift t look like t + S(x + t) - S(x): the apparent motion varies over
-the image, and S follows from how. All photographs are fitted at once, grey level by grey level
-(:mod:`modeharvest.imaging.distortion.fit`); the shifts are found along with S. Source of the idea:
-Maraghechi et al. 2019, the paper's reference for S; the fit is this project's own.
+A distortion S makes a rigid shift t appear as t + S(x + t) - S(x). This apparent motion varies over
+the image, and S is found from the variation. The grey levels of all photographs are fitted at once
+(:mod:`modeharvest.imaging.distortion.fit`), with the shifts as unknowns beside S. The idea is from
+Maraghechi et al. 2019, the paper's reference for S; the fit was developed in this project.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
 _COARSE_PX = 512
-"""Size to which photographs are binned to find their shifts within some px."""
+"""Size to which photographs are binned to estimate their shifts to within a few px."""
 _COARSE_DEGREE = 3
 *_COARSE_BLURS_PX, _BLUR_PX = 12.0, 6.0, 3.0, 0.7
-"""Of the photographs. The first bridges what the binned correlation and S leave; the last makes the
-spline's noise independent of where between pixels it samples, which would else draw S towards half
-pixels."""
+"""Gaussian blurs of the photographs, in turn. The first covers the errors of the binned correlation
+and of S. The last makes the noise of a sample independent of its position between pixels; otherwise
+S would be biased towards half pixels."""
 _ORDER = 5
-"""Of the spline that samples the photographs."""
+"""Order of the spline that interpolates the photographs."""
 _BORDER_PX = 4.0
 _MATCH = 0.5
-"""Photographs that correlate less with the others show something else."""
+"""A photograph whose correlation with the others is lower shows something else."""
 _LEAST_SHIFT, _LEAST_BREADTH = 5.0, 0.05
-"""The longest shift has to be of 5 px, and they have to spread across it by 0.05 of that."""
+"""Least length of the longest shift [px]; least ratio of the shifts' spread across and along."""
 
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """How to calibrate."""
+    """Options of the calibration."""
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
-    """Total degrees of S to compare, ascending, from 2 on, until the criterion rises two times."""
+    """Total degrees of S to compare, ascending, from 2; ends when the BIC rises twice in a row."""
     rotations: bool = True
-    """Whether the target may turn a little in photographs whose shifts are not known."""
+    """Whether small rotations of the target are unknowns; only if the shifts are not given."""
     points: int = 100_000
-    """About how many points of the target to look at; more lower the standard deviation."""
+    """About how many points of the target to use; more points lower the standard deviation."""
 
     def __post_init__(self) -> None:
         if not self.degrees or self.degrees[0] < 2 or list(self.degrees) != sorted(self.degrees):
@@ -71,25 +71,25 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class LensEstimate:
-    """A lens as a fit found it."""
+    """A distortion estimated by a fit, with its covariance."""
 
     distortion: Distortion
-    """What the model made of it."""
+    """The estimated S."""
     coefficients: FloatArray
     covariance: FloatArray
-    """(k,) and (k, k) of the model's unknowns."""
+    """(k,) estimates of the model's unknowns, and their (k, k) covariance."""
     model: PolynomialModel
-    """Which these are."""
+    """Defines the unknowns."""
     noise_sd: float
-    """Noise of an image, estimated from the residual [grey levels]."""
+    """Standard deviation of an image's noise, from the residual [grey levels]."""
     matches: FloatArray
     """(m,) correlation of each image with the mean of the others, without distortion [-]."""
     bic: float = math.nan
-    """Bayesian information criterion, the lower the better, of one set; NaN if not kept."""
+    """Bayesian information criterion, lower is better within one set; NaN if not kept."""
 
     @classmethod
     def of(cls, model: PolynomialModel, fit: Fit, noise: tuple[float, float]) -> LensEstimate:
-        """The lens of a fit, ``noise`` being what :func:`sampled_noise` gives."""
+        """The estimate of a fit; ``noise`` is the result of :func:`sampled_noise`."""
         one, many = noise
         k = len(fit.coefficients)
         return cls(
@@ -99,7 +99,7 @@ class LensEstimate:
         )  # fmt: skip
 
     def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Standard deviation of S [px] at ideal positions [px], by the images' noise alone."""
+        """Standard deviation of S [px] at ideal positions [px], due to image noise alone."""
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         columns = self.model.sensitivities(self.coefficients, row.ravel(), col.ravel())
         products = np.einsum("ckn,kl->cln", columns, self.covariance, optimize=True)
@@ -110,7 +110,7 @@ class LensEstimate:
 
 @dataclass(frozen=True)
 class DegreeTrial:
-    """What a degree of S gave."""
+    """Result of the fit with one polynomial degree of S."""
 
     degree: int
     """Total degree."""
@@ -119,30 +119,30 @@ class DegreeTrial:
     residual_rms: float
     """Scatter of the photographs about their mean [grey levels]."""
     bic: float
-    """Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N for
-    N values; the degree with 0 is taken [-]."""
+    """Bayesian information criterion minus its lowest value: N log(residual^2) + unknowns log N for
+    N values [-]; the degree with 0 is chosen."""
     change_px: float
-    """Rms per component over the image by which S differs from the degree before [px]."""
+    """Rms per component, over the image, of the change of S from the previous degree [px]."""
     sd_px: float
-    """Rms per component over the image of S's standard deviation [px]."""
+    """Rms per component, over the image, of the standard deviation of S [px]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration(LensEstimate):
-    """The lens of a set of photographs, without the part of S that can't be observed."""
+    """Result of a calibration: S without its unobservable part, and the target's motion."""
 
     distortion: PolynomialDistortion
     model: PolynomialModel
-    """S; the model's ``fixed`` terms could not be observed and are zero."""
+    """S and its model, whose ``fixed`` terms are not observable and are zero."""
     shifts: FloatArray
     shifts_sd: FloatArray
-    """(m, 2) motion of the target since the first photograph, along rows and columns [px], and its
-    standard deviation; 0 where given."""
+    """(m, 2) shift of the target since the first photograph (along rows, along columns) [px], and
+    its standard deviation, which is 0 where the shift was given."""
     angles: FloatArray
     angles_sd: FloatArray
-    """(m,) likewise its rotation, from the columns' to the rows' axis [rad]."""
+    """(m,) rotation of the target and its standard deviation, from column to row axis [rad]."""
     trials: tuple[DegreeTrial, ...]
-    """One for each degree."""
+    """One for each degree tried."""
 
 
 def calibrate(
@@ -153,12 +153,12 @@ def calibrate(
 ) -> Calibration:
     """Find the distortion of a lens from photographs of one flat target in several positions.
 
-    InputError if there are too few photographs, of different sizes, without speckle, of different
-    things, or without enough shifts.
+    InputError if the photographs are too few, differ in size, have no speckle, show different
+    objects, or are not shifted enough.
 
     images : m >= 3 photographs (rows, cols), the target shifted along two directions or more.
-    shifts : (m, 2) where the stage was, along rows and columns [px], if known; what they are off by
-        goes into S. Not needed: without them the affine part of S isn't observable and is zero.
+    shifts : (m, 2) stage positions along rows and columns [px], if known; their errors bias S.
+        Without them the affine part of S is not observable and is set to zero.
     """
     options = options or CalibrationOptions()
     if len(images) < 3:
@@ -193,13 +193,13 @@ def _coarse_fit(
     options: CalibrationOptions,
     report: Callable[[], None],
 ) -> tuple[PolynomialModel, Fit]:
-    """Shifts and a cubic S from blurred photographs."""
+    """Estimate the shifts and an S of at most third degree from blurred photographs."""
     rows, cols = photographs[0].shape
     degree = min(_COARSE_DEGREE, options.degrees[-1])
     model = PolynomialModel((rows, cols), degree, fixed=3 if moving[0] else 1)
     c = model.start
     for blur in _COARSE_BLURS_PX:
-        # Where they don't match yet, a fit of the light would sooner wipe out the contrast.
+        # Before the images match, fitting contrast and brightness would rather remove the contrast.
         views = _views(photographs, poses, (*moving, False, False), blur)
         points, _ = _points((rows, cols), poses, options.points // 4)
         fit = fit_views(model, c, views, points, tolerance_px=0.02, max_iterations=10)
@@ -212,14 +212,14 @@ def _trials(
     photographs: Sequence[FloatImage], model: PolynomialModel, fit: Fit,
     moving: tuple[bool, bool, bool], options: CalibrationOptions, report: Callable[[], None],
 ) -> tuple[list[tuple[PolynomialModel, Fit]], float]:  # fmt: skip
-    """One fit a degree, the best one to the end; and the stride of the points [px]."""
+    """A fit for each degree, the best one iterated to convergence; the points' spacing [px]."""
     free = (*moving, True, True)
     views = _views(photographs, fit.poses, free, _BLUR_PX)
     points, stride = _points(model.shape, fit.poses, options.points)
     trials: list[tuple[PolynomialModel, Fit]] = []
     c = fit.coefficients
     for degree in options.degrees:
-        # Coefficients that a degree lacks keep the others from settling soon, and don't matter.
+        # With too low a degree the fit converges slowly; full convergence isn't needed here.
         model, c = model.of_degree(c, degree)
         fit = fit_views(model, c, views, points, tolerance_px=1e-3, max_iterations=6)
         c, views = fit.coefficients, with_poses(views, fit.poses)
@@ -247,9 +247,9 @@ def _given(shifts: ArrayLike | None, count: int) -> FloatArray:
 
 
 def _rough_shifts(photographs: Sequence[FloatImage]) -> FloatArray:
-    """(m, 2) shifts since the first photograph [px], within some px, from binned photographs."""
+    """(m, 2) shifts since the first photograph [px], within a few px, from binned photographs."""
     factor = max(1, max(photographs[0].shape) // _COARSE_PX)
-    register: Any = phase_cross_correlation  # which has no types
+    register: Any = phase_cross_correlation  # has no type annotations
     rows, cols = (n // factor for n in photographs[0].shape)
     whole = np.s_[: rows * factor, : cols * factor]
     blocks = [image[whole].reshape(rows, factor, cols, factor) for image in photographs]
@@ -263,7 +263,7 @@ def _rough_shifts(photographs: Sequence[FloatImage]) -> FloatArray:
 def _views(
     photographs: Sequence[FloatImage], poses: FloatArray, free: tuple[bool, ...], blur: float
 ) -> list[View]:
-    """Photographs as splines; the first one stays where it is."""
+    """Photographs as splines with poses; the pose of the first one is fixed."""
     return [
         View(
             blurred_spline(image, blur, _ORDER),
@@ -278,7 +278,7 @@ def _views(
 def _points(
     shape: tuple[int, ...], poses: FloatArray, count: int
 ) -> tuple[tuple[FloatArray, FloatArray], float]:
-    """Ideal positions on an even grid, about ``count`` a photograph, and its stride [px]."""
+    """Ideal positions on a regular grid, about ``count`` per photograph, and its spacing [px]."""
     shifts = poses[:, :2]
     low, high = -shifts.max(axis=0) - 20.0, np.array(shape) - shifts.min(axis=0) + 20.0
     stride = max(1.0, float(np.sqrt(np.prod(shape) / count)))
@@ -298,7 +298,7 @@ def _require_matches(fit: Fit) -> None:
 
 
 def _require_shifts(poses: FloatArray) -> None:
-    """Raise InputError unless the shifts span the plane: they don't determine S otherwise."""
+    """Raise InputError unless the shifts span the plane; otherwise S is not determined."""
     shifts = poses[:, :2]
     along, across = np.linalg.svd(shifts, compute_uv=False)
     longest = float(np.hypot(*shifts.T).max())
@@ -313,7 +313,7 @@ def _require_shifts(poses: FloatArray) -> None:
 def calibration_of(
     trials: Sequence[tuple[PolynomialModel, Fit]], noise: tuple[float, float]
 ) -> Calibration:
-    """Choose the degree with the lowest BIC; ``noise`` is what :func:`sampled_noise` gives."""
+    """Choose the degree with the lowest BIC; ``noise``: the result of :func:`sampled_noise`."""
     model, fit = min(trials, key=lambda trial: trial[1].bic)
     one, many = noise
     own, covariance = np.zeros(fit.free.shape), fit.inverse * (fit.variance * many / one)

@@ -1,8 +1,8 @@
-"""Distortions from and to files: JSON of our own, OpenCV's storage, DICe's calibration.
+"""Distortion files: this project's JSON, OpenCV's file storage, DICe's calibration files.
 
-Formats that are read: the JSON that :func:`write_distortion` makes; what OpenCV's
-``cv::FileStorage`` writes as YAML, XML or JSON with ``camera_matrix`` (or ``cameraMatrix``, ``K``)
-and ``distortion_coefficients`` (or ``distCoeffs``, ``D``) of 4, 5 or 8 numbers; and DICe's
+Formats that are read: the JSON written by :func:`write_distortion`; the YAML, XML or JSON of
+OpenCV's ``cv::FileStorage`` with ``camera_matrix`` (or ``cameraMatrix``, ``K``) and
+``distortion_coefficients`` (or ``distCoeffs``, ``D``) of 4, 5 or 8 numbers; and DICe's
 ``cal.xml`` with ``OPENCV_LENS_DISTORTION``.
 """
 
@@ -37,7 +37,7 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def write_distortion(path: Path | str, distortion: AnyDistortion) -> None:
-    """Write a distortion as JSON, whole or not at all; every number is kept exactly."""
+    """Write a distortion as JSON, atomically; every number is kept exactly."""
     kind = next(name for name, known in _KINDS.items() if isinstance(distortion, known))
     frame = "px; components along rows (down), columns (right)"
     write_json(path, {"frame": frame, "kind": kind, **to_plain(distortion)})
@@ -69,7 +69,7 @@ def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
 def _from_json(content: Any, path: Path) -> AnyDistortion:
     if not isinstance(content, dict):
         raise InputError(f"expected a distortion at {path}, got {type(content).__name__}")
-    if "kind" not in content:  # OpenCV's storage can be JSON, too
+    if "kind" not in content:  # OpenCV's file storage can also be JSON
         entries = {k: v.get("data") for k, v in content.items() if isinstance(v, dict)}
         return _camera(entries, path)
     name, known = content["kind"], list(_KINDS)
@@ -82,7 +82,7 @@ def _from_json(content: Any, path: Path) -> AnyDistortion:
 
 
 def _numbers(data: str) -> list[float]:
-    """Numbers of an OpenCV matrix."""
+    """Parse the numbers of an OpenCV matrix."""
     return [float(number) for number in re.findall(_NUMBER, data)]
 
 
@@ -93,7 +93,7 @@ def _opencv_yaml(text: str) -> dict[str, list[float]]:
 
 
 def _camera(entries: Mapping[str, Any], path: Path) -> CameraDistortion:
-    """Camera of an OpenCV file's matrices."""
+    """The camera given by the matrices of an OpenCV file."""
     matrix, coefficients = (
         next((np.ravel(entries[name]) for name in names if entries.get(name) is not None), None)
         for names in (_MATRIX, _COEFFICIENTS)
@@ -114,7 +114,7 @@ def _camera(entries: Mapping[str, Any], path: Path) -> CameraDistortion:
 
 
 def _from_dice(root: ElementTree.Element, which: int | str, path: Path) -> CameraDistortion:
-    """Camera of a DICe calibration file."""
+    """The camera given by a DICe calibration file."""
     cameras = [
         {p.get("name", ""): p.get("value", "") for p in item.iter("Parameter")}
         for item in root.findall("ParameterList")

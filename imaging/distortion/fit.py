@@ -1,11 +1,11 @@
 """A distortion that makes several photographs of one flat target agree, by least squares.
 
 Photograph i shows the ideal position x of the target's pattern at phi_S(T_i(x)), T_i a rigid
-motion. The pattern P(x) is not known; the minimum over P of sum_i (c_i I_i(phi_S(T_i x)) + o_i -
-P(x))^2 is at the mean of those photographs that show x, so what is minimised is the scatter about
-it. No photograph is privileged, noise in different photographs stays independent, and the
-covariance of the unknowns is sigma^2 M^-1. sigma, the noise of a photograph, follows from the
-residual by what becomes of white noise where a blurred image is sampled between its pixels.
+motion. The pattern P(x) is unknown. The minimum over P of sum_i (c_i I_i(phi_S(T_i x)) + o_i -
+P(x))^2 is the mean of the photographs that show x, so the fit minimises the scatter about this
+mean. No photograph is privileged, noise in different photographs stays independent, and the
+covariance of the unknowns is sigma^2 M^-1, M the normal matrix. The noise sigma of a photograph is
+the residual corrected for the effect on white noise of blurring and sampling between pixels.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from modeharvest.util.scaled_eigen import ScaledEigen
 
 @dataclass(frozen=True)
 class PolynomialModel:
-    """Polynomials of a total degree, all of their terms or those above the affine ones."""
+    """Polynomials of a given total degree whose terms of lowest degree may be fixed at zero."""
 
     shape: tuple[int, int]
     """(rows, cols) of the image [px]."""
     degree: int
     """Total degree, at least 1."""
     fixed: int = 3
-    """How many terms of each component are zero: 3, the affine ones, where shifts are not known; 1,
-    the constant, where they are; 0 if all are observable."""
+    """Number of terms of each component fixed at zero: 3 (the affine terms) if shifts are unknown,
+    1 (the constant) if shifts are known, 0 if all terms are observable."""
 
     def __post_init__(self) -> None:
         if self.fixed not in (0, 1, 3) or self.terms < 1:
@@ -51,11 +51,11 @@ class PolynomialModel:
 
     @property
     def start(self) -> FloatArray:
-        """(k,) coefficients to begin with: zeros, no distortion."""
+        """(k,) initial coefficients: zeros, that is, no distortion."""
         return np.zeros(2 * self.terms)
 
     def distortion(self, c: FloatArray) -> PolynomialDistortion:
-        """The distortion of these coefficients: first all along rows, then all along columns."""
+        """The distortion with coefficients c (k,): those along rows, then those along columns."""
         full = np.zeros((2, self.terms + self.fixed))
         full[:, self.fixed :] = c.reshape(2, self.terms)
         return PolynomialDistortion(self.shape, full)
@@ -67,7 +67,7 @@ class PolynomialModel:
         return np.array([np.concatenate([basis, zero]), np.concatenate([zero, basis])])
 
     def of_degree(self, c: FloatArray, degree: int) -> tuple[PolynomialModel, FloatArray]:
-        """The model of another degree; coefficients in it, cut or continued by zeros."""
+        """The model of another degree, and ``c`` truncated or padded with zeros for it."""
         other = replace(self, degree=degree)
         full, kept = np.zeros((2, other.terms)), min(self.terms, other.terms)
         full[:, :kept] = c.reshape(2, self.terms)[:, :kept]
@@ -75,30 +75,30 @@ class PolynomialModel:
 
 
 POSE_UNKNOWNS = 5
-"""Of a photograph: shift along rows and columns [px], rotation [rad], contrast, brightness.
+"""Number of unknowns of a photograph: shift (row, col) [px], rotation [rad], contrast, brightness.
 
 The target's point x is at T(x) = centre + R (x - centre) + shift, R a small rotation from the
-columns' to the rows' axis; contrast * level + brightness is as bright as the first photograph."""
+column axis to the row axis; contrast * level + brightness matches the first photograph's levels."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A photograph and what is unknown of it."""
+    """A photograph, the target's pose in it and the image's contrast and brightness."""
 
     spline: SplineImage
-    """Of the photograph."""
+    """Spline interpolation of the photograph."""
     pose: FloatArray
-    """(5,) where the target is in it, and how bright that is: see ``POSE_UNKNOWNS``."""
+    """(5,) the target's pose, contrast and brightness: see ``POSE_UNKNOWNS``."""
     free: tuple[bool, ...] = (False,) * POSE_UNKNOWNS
-    """(5,) which of these are unknown."""
+    """(5,) which entries of ``pose`` are unknowns of the fit."""
     distorted: bool = True
-    """False if the photograph has no distortion, as one of a known pair."""
+    """False if the photograph has no distortion, as an image of a known pair."""
     border_px: float = 4.0
-    """Width of the margin left out [px]: spline and blur know only its mirror image."""
+    """Width of the excluded margin [px], where spline and blur rely on the mirrored image."""
 
 
 def checked_images(images: Sequence[ArrayLike], names: Sequence[str]) -> list[FloatImage]:
-    """The images; InputError if sizes differ or are small, or one shows no pattern."""
+    """The images as floats; InputError if sizes differ or are small, or one shows no pattern."""
     found = [np.asarray(image, dtype=np.float32) for image in images]
     for image, name in zip(found, names, strict=True):
         if image.ndim != 2 or image.shape != found[0].shape or min(image.shape) < 64:
@@ -111,19 +111,19 @@ def checked_images(images: Sequence[ArrayLike], names: Sequence[str]) -> list[Fl
 
 
 def blurred_spline(image: FloatImage, blur_px: float, order: int) -> SplineImage:
-    """The spline of an image blurred by a Gaussian of that standard deviation [px]."""
+    """Spline of an image blurred by a Gaussian with standard deviation ``blur_px`` [px]."""
     return SplineImage.of(ndimage.gaussian_filter(image, blur_px) if blur_px else image, order)
 
 
 def with_poses(views: Sequence[View], poses: FloatArray) -> list[View]:
-    """The same views, in other poses (views, 5)."""
+    """The same views with other poses (views, 5)."""
     return [replace(view, pose=pose) for view, pose in zip(views, poses, strict=True)]
 
 
 def normalised_illumination(
     images: Sequence[FloatImage], shifts: FloatArray | None = None
 ) -> FloatArray:
-    """(m, 5) poses with (m, 2) shifts [px] that give all images the first one's mean and spread."""
+    """(m, 5) poses with given shifts (m, 2) [px]; mean and spread of grey levels as in image 0."""
     mean, spread = (np.array([f(im, dtype=np.float64) for im in images]) for f in (np.mean, np.std))
     poses = np.zeros((len(images), POSE_UNKNOWNS))
     poses[:, :2] = 0.0 if shifts is None else shifts
@@ -137,13 +137,13 @@ _FINE = 16
 
 
 def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, float]:
-    """Variance of a sample, and of the mean of many samples, of white noise of variance 1.
+    """Variance factors of blurred, interpolated white noise: of a sample, of many samples' mean.
 
-    The former is the mean over all positions between pixels; the latter that times how much
-    neighbouring samples have in common: the variance that a field sees that varies slowly from
-    sample to sample. It is 1 for a stride of 1 px: no information is lost there.
+    The first is averaged over all positions between pixels. The second is the sum of the samples'
+    covariances, which holds for a field that varies slowly from sample to sample. It is 1 for a
+    stride of 1 px, where no information is lost. Both are for noise of variance 1.
 
-    blur_px, order : standard deviation of the blur before the spline [px]; its order, 3 or 5.
+    blur_px, order : standard deviation of the blur before the spline [px]; the spline's order.
     stride_px : distance between samples along rows and columns [px].
     """
     lags, correlations = sampled_correlations(blur_px, order, stride_px)
@@ -153,10 +153,10 @@ def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, 
 def sampled_correlations(
     blur_px: float, order: int, stride_px: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lags [px] along an axis, and covariances at them of white noise blurred and sampled."""
+    """Lags [px] along one axis, and the covariances of blurred, sampled white noise at them."""
     reach = int(np.ceil(16 + 6 * blur_px))
     impulse = np.zeros((24, 2 * reach + 1))
-    impulse[:, reach] = 1.0  # a line, so that the other axis has no say
+    impulse[:, reach] = 1.0  # a line: the response doesn't depend on the other axis
     if blur_px > 0.0:
         impulse = ndimage.gaussian_filter1d(impulse, blur_px, axis=1)
     along = np.arange(2 * reach * _FINE) / _FINE
@@ -169,33 +169,33 @@ def sampled_correlations(
 
 
 _CHUNK = 4096
-"""Points that are looked at a time."""
+"""Number of points assembled at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where the least squares ended."""
+    """Result of the least-squares fit."""
 
     coefficients: FloatArray
-    """(k,) of the model."""
+    """(k,) coefficients of the model."""
     poses: FloatArray
-    """(views, 5) of each view."""
+    """(views, 5) poses of the views."""
     inverse: FloatArray
-    """(K, K) of the normal matrix: of the coefficients, then of each view's unknowns."""
+    """(K, K) inverse normal matrix: the coefficients, then the free unknowns of each view."""
     free: NDArray[np.bool_]
     """(views, 5) which of the views' unknowns are free, in the order of ``inverse``."""
     sum_of_squares: float
-    """Scatter about the mean [grey levels squared]."""
+    """Sum of squares of the scatter about the mean [grey levels squared]."""
     freedom: int
-    """Degrees of freedom of that."""
+    """Degrees of freedom of ``sum_of_squares``."""
     converged: bool
-    """Whether the last step was short enough."""
+    """Whether the last step was below the tolerance."""
     matches: FloatArray
     """(views,) correlation of each photograph with the mean of the others [-]."""
 
     @property
     def variance(self) -> float:
-        """Mean square of the scatter, the noise as the spline passes it [grey levels squared]."""
+        """Mean square of the scatter: variance of the interpolated noise [grey levels squared]."""
         return self.sum_of_squares / self.freedom
 
     @property
@@ -211,9 +211,9 @@ def fit_views(
 ) -> Fit:  # fmt: skip
     """Find the model's coefficients and the views' poses by Gauss-Newton.
 
-    model, c, views : the distortions to choose from; (k,) coefficients and poses to begin with.
-    points : (n,) rows and columns of ideal positions to look at [px].
-    tolerance_px : largest change of S or of a shift [px] at which to stop.
+    model, c, views : model of S; its initial coefficients (k,); photographs with initial poses.
+    points : (n,) rows and columns of the ideal positions to use [px].
+    tolerance_px : iterations stop when S and the shifts change by less than this [px].
     """
     free = np.array([view.free for view in views])
     half_size = 0.5 * max(views[0].spline.shape)
@@ -242,16 +242,16 @@ def _assemble(
     views: Sequence[View],
     points: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, float, int, FloatArray]:
-    """Normal equations of the scatter about the mean, chunk by chunk: matrix and gradient.
+    """Assemble the normal matrix and the gradient of the scatter about the mean.
 
-    And its sum of squares, the degrees of freedom, and each view's correlation with the mean.
+    Also its sum of squares, degrees of freedom, and each view's correlation with the others' mean.
     """
     k, own = len(c), [sum(view.free) for view in views]
     ends = k + np.cumsum(own)
     where = [np.r_[:k, end - n : end] for n, end in zip(own, ends, strict=True)]
     size = int(ends[-1])
     matrix, gradient, squares, freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0
-    sums = np.zeros((len(views), 6))  # of 1, a, b, a^2, b^2, a b: a view, and the mean of others
+    sums = np.zeros((len(views), 6))  # of 1, a, b, a^2, b^2, a b; a: a view, b: mean of the others
     distortion = model.distortion(c)
     for first in range(0, points[0].size, _CHUNK):
         row, col = (a[first : first + _CHUNK] for a in points)
@@ -283,7 +283,7 @@ def _sample(
     row: FloatArray,
     col: FloatArray,
 ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-    """Where a view shows the points; grey levels and their derivatives, 0 elsewhere."""
+    """(inside, grey levels, derivatives) of a view at the points; levels are 0 where not inside."""
     rows, cols = view.spline.shape
     down, right, angle, contrast, brightness = view.pose
     arm_row, arm_col = row - 0.5 * (rows - 1), col - 0.5 * (cols - 1)

@@ -5,8 +5,8 @@ px and in the image frame: components along the rows' index (down) and the colum
 Source of the camera model, here without thin prisms and tilts:
 https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html.
 
-f(phi_S(x)) of that equation is :func:`undistorted`: each image is resampled once on the ideal pixel
-grid, and a correlation of such images needs to know nothing of the lens.
+:func:`undistorted` computes f(phi_S(x)) of that equation: it resamples each image once on the ideal
+pixel grid, so that the correlation of such images needs no lens model.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within
 
 Positions = tuple[FloatArray, FloatArray]
-"""(row, col) [px], both of one shape."""
+"""(row, col) [px], two arrays of the same shape."""
 _BAND = 64
-"""Rows that are resampled, or inverted, in one go."""
+"""Number of rows resampled, or inverted, at a time."""
 _CHUNK = 8192
-"""Points that are inverted at a time, so that they stay in the cache."""
+"""Number of points inverted at a time, so that they stay in the cache."""
 _SETTLED_PX = 1e-7
-"""Newton's error is squared by a step: one this short leaves less than rounding."""
+"""Newton's method converges quadratically: after so short a step the error is below rounding."""
 _STEPS = 30
 
 
 class Distortion(ABC):
-    """A mapping of ideal image positions to those where a lens shows them.
+    """A mapping of ideal image positions to the positions observed through a lens.
 
-    Kinds define :meth:`shift` and :meth:`gradient`; the mapping and its inverse follow. Positions
-    are (row, col) in px, whole numbers at pixel centres, of any shapes that broadcast together;
-    an open grid, (rows, 1) and (1, cols), is fastest.
+    Subclasses define :meth:`shift` and :meth:`gradient`; mapping and inverse follow. Positions are
+    (row, col) in px, whole numbers at pixel centres, of any shapes that broadcast together; an
+    open grid, (rows, 1) and (1, cols), is fastest.
     """
 
     @abstractmethod
@@ -59,10 +59,10 @@ class Distortion(ABC):
         return np.add(row, d_row), np.add(col, d_col)
 
     def ideal(self, row: ArrayLike, col: ArrayLike) -> Positions:
-        """Invert phi_S: the ideal positions of what is observed at (row, col) [px].
+        """Invert phi_S: ideal positions of the points observed at (row, col) [px].
 
-        By Newton's method, to rounding (better than 1e-10 px); NaN where a position is NaN.
-        InputError if the mapping is not one-to-one there: it folds.
+        Newton's method, to rounding (better than 1e-10 px); NaN where a position is NaN.
+        InputError if the mapping folds, that is, is not one-to-one there.
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         observed = np.stack([row.ravel(), col.ravel()])
@@ -73,7 +73,7 @@ class Distortion(ABC):
         return found[0].reshape(row.shape), found[1].reshape(row.shape)
 
     def _newton(self, observed: FloatArray) -> FloatArray:
-        """(2, n) ideal positions of (2, n) observed ones."""
+        """(2, n) ideal positions of observed positions (2, n) [px]."""
         found = observed - np.stack(self.shift(*observed))
         for _ in range(_STEPS):
             misfit = np.stack(self.observed(*found)) - observed
@@ -97,7 +97,7 @@ def _folds(position: FloatArray) -> InputError:
 
 
 def require_finite(values: FloatArray, what: str) -> None:
-    """Raise InputError if a number of a distortion isn't one."""
+    """Raise InputError if a value of a distortion is NaN or infinite."""
     if not np.isfinite(values).all():
         raise InputError(f"distortion: expected finite {what}, got NaN or infinity")
 
@@ -107,14 +107,14 @@ class PolynomialDistortion(Distortion):
     """S as a polynomial of a total degree, in products of Chebyshev polynomials.
 
     S(row, col) = sum over i + j <= degree of c_ij T_i(xi) T_j(eta), where xi and eta run from -1 to
-    1 from the first to the last column and row. Beyond the image it goes on as it is.
+    1 from the first to the last column and row. The same polynomial holds beyond the image.
     """
 
     shape: tuple[int, int]
     """(rows, cols) of the image [px]."""
     coefficients: FloatArray
-    """(2, n) c_ij along the rows' and the columns' index [px], n = (degree + 1)(degree + 2)/2, by
-    rising i + j, in each of them by rising j: 1, xi, eta, T_2(xi), xi eta, T_2(eta), ..."""
+    """(2, n) c_ij along the row and the column index [px], n = (degree + 1)(degree + 2)/2, in the
+    order of i + j, then of j: 1, xi, eta, T_2(xi), xi eta, T_2(eta), ..."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
@@ -146,7 +146,7 @@ class PolynomialDistortion(Distortion):
 
     @cached_property
     def _tables(self) -> tuple[FloatArray, FloatArray]:
-        """(2, n, n) coefficients [component, j, i], and (2, 2, n, n) those of the derivatives."""
+        """(2, n, n) coefficients [component, j, i], and (2, 2, n, n) for the derivatives."""
         n, (rows, cols) = self.degree + 1, self.shape
         table = np.zeros((2, n, n))
         i, j = np.array(self.orders(self.degree)).T
@@ -179,7 +179,7 @@ class PolynomialDistortion(Distortion):
         return eta, xi
 
     def _evaluate(self, tables: FloatArray, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """(..., positions) sums for tables (..., n, n), each by one matrix product along col."""
+        """(..., positions) polynomials with coefficients (..., n, n), by matrix products."""
         eta, xi = self._normalised(row, col)
         along_row, along_col = _powers(eta, self.degree), _powers(xi, self.degree)
         partial = np.tensordot(tables, along_col, axes=1)  # (..., j, positions of col)
@@ -238,7 +238,7 @@ class CameraDistortion(Distortion):
         return x, y
 
     def radial(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Numerator and denominator of q, both less 1, at s = r^2."""
+        """Numerator and denominator of q, each minus 1, at s = r^2."""
         top = s * (self.k1 + s * (self.k2 + s * self.k3))
         return top, s * (self.k4 + s * (self.k5 + s * self.k6))
 
@@ -272,13 +272,13 @@ class CameraDistortion(Distortion):
 
 @dataclass(frozen=True, eq=False)
 class SampledDistortion(Distortion):
-    """S given on a grid, with a bicubic spline through it; beyond, it goes on linearly."""
+    """S sampled on a grid: bicubic spline interpolation, linear extrapolation outside."""
 
     rows: FloatArray
     cols: FloatArray
-    """(n,) and (m,) positions of the grid's lines [px], ascending, at least 4 of each."""
+    """(n,) and (m,) positions of the grid lines [px], ascending, at least 4 of each."""
     field: FloatArray
-    """(2, n, m) S along the rows' and the columns' index [px]."""
+    """(2, n, m) S along the row and the column index [px]."""
 
     def __post_init__(self) -> None:
         for name in ("rows", "cols", "field"):
@@ -301,7 +301,7 @@ class SampledDistortion(Distortion):
     def _evaluate(
         self, row: ArrayLike, col: ArrayLike, orders: tuple[tuple[int, int], ...]
     ) -> tuple[list[tuple[FloatArray, ...]], FloatArray, FloatArray]:
-        """Derivatives of both components at the nearest point of the grid, and how far that is."""
+        """Derivatives of both components at the nearest point of the grid, and its distance."""
         row, col = np.asarray(row, dtype=np.float64), np.asarray(col, dtype=np.float64)
         near_row = np.clip(row, self.rows[0], self.rows[-1])
         near_col = np.clip(col, self.cols[0], self.cols[-1])
@@ -309,7 +309,7 @@ class SampledDistortion(Distortion):
         found = []
         for spline in self._splines:
             if is_grid and (np.diff(row[:, 0]) > 0).all() and (np.diff(col[0]) > 0).all():
-                # Where the axes were clipped they don't ascend strictly, which is allowed.
+                # Clipped axes don't ascend strictly, which the spline allows.
                 at = near_row[:, 0], near_col[0]
                 values = tuple(spline(*at, dx=i, dy=j) for i, j in orders)
             else:
@@ -330,11 +330,11 @@ class SampledDistortion(Distortion):
 
 
 def undistorted(image: ArrayLike, distortion: Distortion, order: int = 5) -> NDArray[np.float32]:
-    """Free an image (rows, cols) from its distortion: f(phi_S(x)) at pixels x of the ideal grid.
+    """Undistort an image (rows, cols): f(phi_S(x)) at pixels x of the ideal grid.
 
-    Where phi_S leaves the photograph, the grey level is that of its nearest pixel, and
-    :func:`undistorted_mask` is False. ``order`` is of the B-spline that interpolates the
-    photograph. InputError if the image isn't two-dimensional, or there is no such order.
+    Where phi_S(x) lies outside the photograph, the grey level is that of its nearest pixel, and
+    :func:`undistorted_mask` is False. ``order``: of the B-spline that interpolates the
+    photograph. InputError if the image isn't two-dimensional, or the order isn't available.
     """
     spline = SplineImage.of(image, order)
     rows, cols = spline.shape
@@ -348,9 +348,9 @@ def undistorted(image: ArrayLike, distortion: Distortion, order: int = 5) -> NDA
 
 
 def undistorted_mask(mask: ArrayLike, distortion: Distortion) -> NDArray[np.bool_]:
-    """Free a mask (rows, cols) from the distortion: that of the photograph's nearest pixel.
+    """Undistort a mask (rows, cols), by the value at the nearest pixel of the photograph.
 
-    All True gives the pixels of the ideal grid that were photographed. InputError if not plane.
+    All True gives the pixels of the ideal grid that were photographed. InputError unless 2-D.
     """
     inside = np.asarray(mask, dtype=np.bool_)
     if inside.ndim != 2:
@@ -367,7 +367,7 @@ def undistorted_mask(mask: ArrayLike, distortion: Distortion) -> NDArray[np.bool
 
 
 def _observed_from(distortion: Distortion, shape: tuple[int, ...], band: slice) -> Positions:
-    """phi_S at the pixels of some rows."""
+    """phi_S at the pixels of a band of rows."""
     row = np.arange(shape[0], dtype=np.float64)[band, None]
     col = np.arange(shape[1], dtype=np.float64)[None, :]
     return distortion.observed(row, col)
@@ -376,9 +376,9 @@ def _observed_from(distortion: Distortion, shape: tuple[int, ...], band: slice) 
 def apart_without_affine(
     found: Distortion, true: Distortion, row: ArrayLike, col: ArrayLike
 ) -> FloatArray:
-    """(2, ...) S_found - S_true [px] at positions that broadcast together [px].
+    """(2, ...) S_found - S_true [px] at positions (row, col) [px] that broadcast together.
 
-    Without its affine part, which can't be observed.
+    The affine part of the difference, which is not observable, is subtracted.
     """
     row, col = np.broadcast_arrays(row, col)
     apart = np.stack(found.shift(row, col)) - np.stack(true.shift(row, col))
@@ -389,7 +389,7 @@ def apart_without_affine(
 
 
 def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
-    """Ideal positions, each (rows, cols) [px], that the pixels show; InputError if S folds."""
+    """Ideal positions (row, col) of the pixels, each (rows, cols) [px]; InputError if S folds."""
     row, col = np.ogrid[: shape[0], : shape[1]]
     strips = [slice(k, k + _BAND) for k in range(0, shape[0], _BAND)]
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
@@ -402,11 +402,11 @@ _NEGLIGIBLE_PX = 1e-12
 
 
 def without_affine(distortion: Distortion, shape: tuple[int, int]) -> PolynomialDistortion:
-    """The same distortion without its affine part over images of (rows, cols) px, as a polynomial.
+    """The distortion without its affine part over images of (rows, cols) px, as a polynomial.
 
-    The terms 1, xi, eta of its Chebyshev series over the image are left out, and those of the
-    highest degrees where they are negligible; exact for lenses that are polynomials of degree 9
-    or less (those of k1 ... k3, p1, p2).
+    The terms 1, xi, eta of its Chebyshev series over the image are left out, and so are negligible
+    terms of the highest degrees. Exact for lenses that are polynomials of degree 9 or less (those
+    with k1 ... k3, p1, p2 only).
     """
     nodes = chebyshev.chebpts1(_DEGREE + 1)
     row, col = (0.5 * (n - 1) * (1.0 + nodes) for n in shape)

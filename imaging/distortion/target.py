@@ -1,8 +1,8 @@
-"""Photographs of a flat speckled target that a stage shifts: what a distortion is calibrated from.
+"""Virtual calibration photographs of a flat speckled target that a stage shifts.
 
-The target fills the image and moves rigidly, so whatever else appears to move is the lens. The
-point of the target that the first photograph shows at the ideal position x is at x + t in one
-whose shift is t; a pixel p shows the target at phi_S^-1(p) - t, evaluated exactly.
+The target fills the image and moves rigidly, so any other apparent motion is due to the lens. The
+point of the target that the first photograph shows at the ideal position x is at x + t in a
+photograph with shift t. A pixel p shows the target at phi_S^-1(p) - t, evaluated exactly.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class CalibrationTarget:
     )  # fmt: skip
     """Intended shifts (along columns, along rows) [px], one for each photograph."""
     stage_sd_px: float = 0.3
-    """Standard deviation of the stage's error, of each component of each shift [px]."""
+    """Standard deviation of the stage's error in each component of each shift [px]."""
     seed: int = 0
-    """Of the stage's errors, and of the target's speckle."""
+    """Seed of the stage's errors and of the target's speckle."""
     speckle: SpeckleSpec | None = None
-    """The target's pattern, but for its seeds; the specimen's where it is None."""
+    """The target's pattern, whose seeds are ignored; None for the specimen's pattern."""
 
     def __post_init__(self) -> None:
         if not self.shifts_px or not np.isfinite(self.shifts_px).all():
@@ -44,7 +44,7 @@ class CalibrationTarget:
 
     @property
     def true_shifts(self) -> FloatArray:
-        """(m, 2) where the stage went, along (rows, columns) [px]."""
+        """(m, 2) actual shifts of the stage, along (rows, columns) [px]."""
         intended = np.array(self.shifts_px)[:, ::-1]
         error = np.random.default_rng(self.seed).normal(0.0, 1.0, intended.shape)
         return np.asarray(intended + self.stage_sd_px * error)
@@ -53,10 +53,10 @@ class CalibrationTarget:
 def photograph_target(
     target: CalibrationTarget, speckle: SpeckleSpec, points: Positions, sensor: Sensor, bits: int
 ) -> Iterator[tuple[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
-    """Make the photographs one after the other: "calibration_00", ... and (rows, cols) levels.
+    """Make the photographs one by one: name ("calibration_00", ...) and (rows, cols) grey levels.
 
     target, sensor, bits : shifts and pattern; the camera.
-    speckle : the pattern if the target has none of its own, but for its seeds.
+    speckle : the pattern if ``target.speckle`` is None; its seeds are ignored.
     points : (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.
     """
     rows, cols = points[0].shape

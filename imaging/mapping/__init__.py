@@ -1,1 +1,1 @@
-"""The inverse isoparametric mapping: which element covers a pixel, and where in it."""
+"""The inverse isoparametric mapping: each pixel's element and local coordinates."""

@@ -1,9 +1,9 @@
 """Bernstein polynomials over reference elements, and positive Jacobians.
 
 That a Jacobian is positive everywhere in an element is proved, not sampled. The determinant is a
-polynomial; if its Bernstein coefficients are positive, so is it. Where they aren't, the element is
-cut into four and each part is asked again, until a corner value shows a violation or every part is
-proved. Only then is the element's map one to one.
+polynomial; it is positive if its Bernstein coefficients are. Where they aren't, the element is
+divided into four and each part is tested, until a corner value shows a violation or every part is
+proved positive. Only with a positive Jacobian is the element's map one to one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from modeharvest.util.errors import InputError
 def lattice_points(triangular: bool, degree: int) -> FloatArray:
     """(p, 2) equidistant points that determine a polynomial of ``degree`` on the domain.
 
-    Total degree on the triangle, degree in each coordinate on the square.
+    The degree is the total degree on the triangle, the degree in each coordinate on the square.
     """
     steps = [(i, j) for i in range(degree + 1) for j in range(degree + 1)]
     if triangular:
@@ -30,10 +30,10 @@ def lattice_points(triangular: bool, degree: int) -> FloatArray:
 
 
 def bernstein(triangular: bool, degree: int, xi: FloatArray) -> FloatArray:
-    """(..., p) Bernstein polynomials at local coordinates (..., 2), ordered like the lattice.
+    """(..., p) Bernstein polynomials at local coordinates (..., 2), ordered like lattice_points.
 
-    A polynomial lies between the least and the greatest of its Bernstein coefficients; those
-    of a mapping are its Bézier control points, whose convex hull holds the element.
+    A polynomial lies between the least and the greatest of its Bernstein coefficients. Those
+    of a mapping are its Bézier control points, whose convex hull contains the element.
     """
     x, y = xi[..., 0], xi[..., 1]
     columns = []
@@ -51,7 +51,7 @@ def bernstein(triangular: bool, degree: int, xi: FloatArray) -> FloatArray:
 
 
 def to_bernstein(triangular: bool, degree: int) -> FloatArray:
-    """(p, p) matrix from values at the lattice to Bernstein coefficients."""
+    """(p, p) matrix from values at the lattice points to Bernstein coefficients."""
     values = bernstein(triangular, degree, lattice_points(triangular, degree))
     return np.asarray(np.linalg.inv(values), dtype=np.float64)
 
@@ -67,14 +67,14 @@ _ROUNDING = 1e-12  # of the largest Bernstein coefficient
 
 
 def sub_elements(triangular: bool) -> FloatArray:
-    """(4, 3) the quarters of a reference domain: xi = (origin xi, origin eta) + scale xi'."""
+    """(4, 3) origin xi, origin eta, scale of a domain's quarters: xi = origin + scale xi'."""
     if triangular:
         return np.array([[0, 0, 0.5], [0.5, 0, 0.5], [0, 0.5, 0.5], [0.5, 0.5, -0.5]])
     return np.array([[s, t, 0.5] for s in (-0.5, 0.5) for t in (-0.5, 0.5)])
 
 
 def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str) -> IntArray:
-    """Cells whose Jacobian isn't positive everywhere at ``positions`` (n, 2) (x right, y up)."""
+    """Cells whose Jacobian isn't positive everywhere, for node ``positions`` (n, 2) (y up)."""
     triangular = reference_element(element).triangular
     degree = 2 if triangular else 3
     points = lattice_points(triangular, degree)
@@ -90,7 +90,7 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
         return np.empty(0, dtype=np.int64)
     unproved = np.flatnonzero(~proved)
     coefficients = all_coefficients[unproved]
-    # Where a Bernstein coefficient is the polynomial's value.
+    # At the corners a Bernstein coefficient is the polynomial's value.
     ends = np.column_stack([points, 1 - points.sum(axis=1)]) if triangular else np.abs(points)
     is_one = np.isclose(ends, 1.0)
     corners = np.flatnonzero(is_one.any(axis=1) if triangular else is_one.all(axis=1))
@@ -118,9 +118,9 @@ def _prove(
     positions: FloatArray, cells: IntArray, slopes: FloatArray, convert: FloatArray,
     coefficients: FloatArray, proved: BoolArray, thread: int, threads: int,
 ) -> None:  # fmt: skip
-    """Bernstein coefficients of every determinant, and whether all are positive.
+    """Compute the Bernstein coefficients of every determinant, and whether all are positive.
 
-    ``slopes`` (2, q, k): derivatives of the shape functions at the lattice's points.
+    ``slopes`` (2, q, k): derivatives of the shape functions at the lattice points.
     """
     for e in range(thread, len(cells), threads):
         found = coefficients[e]
@@ -142,7 +142,7 @@ def _prove(
 def require_positive_jacobian(
     positions: FloatArray, cells: IntArray, element: str, where: str = "mesh"
 ) -> None:
-    """Raise InputError, naming the first cell, unless all Jacobians are positive."""
+    """Raise InputError, naming the first such cell, unless all Jacobians are positive."""
     lost = np.flatnonzero(~np.isfinite(positions).all(axis=1))
     if lost.size:
         raise InputError(

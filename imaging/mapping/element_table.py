@@ -1,4 +1,4 @@
-"""The elements of a mesh over the pixels of an image, tabulated for the compiled kernels."""
+"""Table of a mesh's elements in pixel coordinates, for the compiled kernels."""
 
 from __future__ import annotations
 
@@ -19,70 +19,70 @@ from modeharvest.util.compiled import compiled, in_parallel
 from modeharvest.util.elements import ReferenceElement, monomial_gradients, reference_element
 
 BEYOND = (0.25, 0.1, 0.03)
-"""How far beyond an element's edges, in (xi, eta), its map is tried to be proved one to one."""
+"""Distances beyond an element's edges, in (xi, eta), for which to prove its map one to one."""
 CLEAR_OF_EDGES = 1e-6
-"""In xi, eta; pixels on an edge come out within some 1e-9."""
+"""Distance from the edges, in xi and eta, above which a pixel counts as inside an element."""
 UNASSIGNED, EDGE, INSIDE, OVERLAPPING, EXCLUDED = 0, 1, 2, 3, 4
-"""States of a pixel: not assigned yet, on an element's edge, inside it, inside two; left out."""
-_AFFINE_PX = 1e-13  # terms of higher degree that add up to less are rounding
+"""States of a pixel: not assigned yet, on an element's edge, inside one, inside two, excluded."""
+_AFFINE_PX = 1e-13  # higher terms whose absolute sum is smaller are rounding errors
 
 
 class ElementTable(NamedTuple):
     """A mesh of m elements with k sides each; positions are (row, col)."""
 
     polynomials: FloatArray
-    """(m, 2, 9) position relative to the centre [px]."""
+    """(m, 2, 9) monomial coefficients of the position relative to the centre [px]."""
     absolute: FloatArray
-    """(m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check."""
+    """(m, 2, 9) those of (x, y) [mm]; used for the residual only, which makes it a check."""
     sides: FloatArray
     """(m, k, 2, 3) coefficients of 1, u, u^2 of the position along each side, 0 <= u <= 1, relative
     to the centre [px]."""
     centres: FloatArray
-    """(m, 2) whole pixels."""
+    """(m, 2) elements' centres, rounded to whole pixels."""
     affine: BoolArray
-    """(m,) whether the polynomials have no terms of higher than the first degree."""
+    """(m,) whether the polynomials are of first degree."""
     row_from: IntArray
     row_to: IntArray
-    """(m,) the image rows row_from ... row_to - 1 may hold pixels of it."""
+    """(m,) the element's pixels lie in the image rows row_from ... row_to - 1."""
     corners: FloatArray
-    """(k, 2) local coordinates of the corners, where side i begins and side i - 1 ends."""
+    """(k, 2) local coordinates of the corners; corner i begins side i and ends side i - 1."""
     bezier: FloatArray
-    """(p, 9) from polynomials to control points."""
+    """(p, 9) matrix from monomial coefficients to Bézier control points."""
     slopes: FloatArray
-    """(len(BEYOND), 9, 2 q) from polynomials to the Bernstein coefficients of the two derivatives
-    over the reference domain enlarged."""
+    """(len(BEYOND), 9, 2 q) matrices from monomial coefficients to the Bernstein coefficients of
+    the two derivatives over the enlarged reference domain."""
     quarters: FloatArray
-    """(4, 3) sub-elements."""
+    """(4, 3) sub-elements, see :func:`~modeharvest.imaging.mapping.bernstein.sub_elements`."""
     middle: float
-    """Both local coordinates of the reference domain's middle."""
+    """Centre of the reference domain: the value of both local coordinates."""
     triangular: bool
     """True for triangles, False for quadrilaterals."""
 
 
 class Pixels(NamedTuple):
-    """What is found, over some rows of an image, pixels in the order of memory."""
+    """Result of the mapping for a band of image rows; n pixels in row-major order."""
 
     element: NDArray[np.int32]
-    """(n,) int32 element, -1 where none is."""
+    """(n,) int32 element number, -1 outside the mesh."""
     values: FloatArray
-    """(c, n) fields at the pixels, NaN where no element is."""
+    """(c, n) fields at the pixels, NaN outside the mesh."""
     residual: NDArray[np.float32]
-    """(n,) float32 [px], NaN where no element is; (0,) if it isn't computed, and then ``values``
-    are left as they were where no element is."""
+    """(n,) float32 residual of the mapping [px], NaN outside the mesh. Shape (0,): not computed;
+    ``values`` outside the mesh are then not overwritten."""
     first_row: int
-    """The first of these rows in the image."""
+    """Image row of the first pixel."""
     cols: int
-    """Pixels a row."""
+    """Pixels per row."""
     x0: float
     y0: float
     pixel_size: float
-    """Of the image's grid [mm]."""
+    """Of the image's :class:`~modeharvest.imaging.grid.PixelGrid` [mm]."""
 
 
 def tabulate_elements(
     nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid
 ) -> ElementTable:
-    """Lay a mesh (nodes (n, 2) [mm], cells (m, k)) over the pixels of a grid."""
+    """Tabulate the elements of a mesh (nodes (n, 2) [mm], cells (m, k)) on a pixel grid."""
     reference = reference_element(element)
     triangular = reference.triangular
     count, sides = len(cells), 3 if triangular else 4
@@ -103,7 +103,7 @@ def tabulate_elements(
 
 
 def _enlarged_slopes(reference: ReferenceElement, beyond: float) -> FloatArray:
-    """(9, 2 q) derivatives along xi, then along eta, as Bernstein coefficients."""
+    """(9, 2 q) Bernstein coefficients of the monomials' derivatives by xi, then by eta."""
     centre, triangular = reference.middle, reference.triangular
     factor = 1.0 + beyond * (3.0 if triangular else 1.0)
     points = centre + factor * (lattice_points(triangular, 2) - centre)
@@ -116,7 +116,7 @@ def _tabulate(
     elements: ElementTable, nodes: FloatArray, position_px: FloatArray, cells: IntArray,
     coefficients: FloatArray, rows: int, thread: int, threads: int,
 ) -> None:  # fmt: skip
-    """Fill in the elements: centres, polynomials, sides, and the image rows they reach into."""
+    """Fill in the elements' centres, polynomials, sides, and range of image rows."""
     for e in range(thread, len(cells), threads):
         cell, centre = cells[e], elements.centres[e]
         for i in range(2):
@@ -153,7 +153,7 @@ def _tabulate(
 def _side(
     elements: ElementTable, e: int, side: int, position_px: FloatArray, cell: IntArray
 ) -> None:
-    """Position along a side: from its corner to the next, through the node between, if any."""
+    """Fill in the position along a side, from its corner to the next via any mid-side node."""
     sides = elements.sides.shape[1]
     for i in range(2):
         a = position_px[cell[side], i] - elements.centres[e, i]
@@ -169,10 +169,10 @@ def _side(
 
 @compiled(inner=True, relaxed=True)
 def proved_reach(polynomial: FloatArray, slopes: FloatArray, centre: float) -> float:
-    """How far beyond its edges, in (xi, eta), an element's map is one to one, proved; else 0.
+    """Distance beyond its edges, in (xi, eta), to which an element's map is proved one to one.
 
-    Sufficient on a convex domain: ||A^-1 J - 1|| < 1 there, with A the Jacobian in the middle;
-    the norm is convex, so the Bernstein coefficients of J bound it.
+    0 if not proved. Sufficient on a convex domain: ||A^-1 J - 1|| < 1, A the Jacobian at the
+    centre; the norm is convex, so the Bernstein coefficients of J bound it.
     """
     a = np.empty((2, 2))
     for i in range(2):
@@ -200,9 +200,9 @@ def proved_reach(polynomial: FloatArray, slopes: FloatArray, centre: float) -> f
 
 
 def bands(elements: ElementTable, rows: int, height: int) -> tuple[IntArray, IntArray]:
-    """(start, visits): the elements that reach into each band of ``height`` rows.
+    """(start, visits): the elements that reach into each band of ``height`` image rows.
 
-    Those of band b are ``visits[start[b]:start[b + 1]]``, ascending.
+    The elements of band b are ``visits[start[b]:start[b + 1]]``, ascending.
     """
     first, past = elements.row_from // height, (elements.row_to - 1) // height + 1
     past = np.where(elements.row_to > elements.row_from, past, first)
@@ -212,10 +212,10 @@ def bands(elements: ElementTable, rows: int, height: int) -> tuple[IntArray, Int
 
 @compiled()
 def fill_buckets(ranges: IntArray, rows: int, cols: int) -> tuple[IntArray, IntArray]:
-    """(start, members): the elements that reach into each bucket of a grid of them.
+    """(start, members): the elements that reach into each bucket of a grid (rows, cols).
 
-    ``ranges`` (m, 4) are each element's first row and column of buckets, and those past its last.
-    Of bucket b, by rows, they are ``members[start[b]:start[b + 1]]``, ascending.
+    ``ranges`` (m, 4): an element's first bucket row and column, and one past its last ones. The
+    elements of bucket b, row-major, are ``members[start[b]:start[b + 1]]``, ascending.
     """
     start = np.zeros(rows * cols + 1, dtype=np.int64)
     for top, left, bottom, right in ranges:

@@ -1,14 +1,14 @@
-"""Compiled kernels: the inverse of one element's map, (row, col) to (xi, eta), and its start.
+"""Compiled kernels: inverse of one element's map, (row, col) to (xi, eta), and initial guesses.
 
-The extreme points of an element on a row of pixels lie on its sides, whose positions are
-quadratic in the parameter along them; so the row's pixels in it are bounded by the roots of
-quadratic equations. There the local coordinates are known; between the two a cubic with the right
-values and slopes at both ends is a start for Newton's method.
+The two ends of a pixel row within an element lie on its sides. The position along a side is
+quadratic in its parameter, so the ends follow from the roots of quadratic equations. The local
+coordinates at both ends are known; between them, the cubic with the exact values and slopes at
+both ends is the initial guess of Newton's method.
 
-A batch of pixels runs through Newton's method in step, a loop without branches that the compiler
-turns into vector instructions; what it gives is checked pixel by pixel. Where that fails, an
-exhaustive search takes over: the element is halved until the Bézier control points' box of a part
-can't hold the pixel or Newton's method finds it.
+A batch of pixels runs through Newton's method together, in a loop without branches that the
+compiler vectorises; the result is checked pixel by pixel. Where the check fails, an exhaustive
+search follows: the element is subdivided until the bounding box of a part's Bézier control points
+excludes the pixel or Newton's method finds it.
 
 Coordinates are (row, col) in px relative to a whole pixel near the element's centre.
 """
@@ -23,24 +23,24 @@ from modeharvest.util.compiled import compiled
 Coefficients = tuple[float, ...]
 
 ACCEPTED_PX = 1e-10
-ON_EDGE = 1e-9  # pixels this far outside in xi, eta still belong to the element
+ON_EDGE = 1e-9  # in xi, eta: pixels at most so far outside still belong to the element
 _BATCH_STEPS = 8
 _NEWTON_STEPS = 20
-_SETTLED = 1e-8  # in xi, eta: Newton's error is squared by a step, so this one left rounding
-_RUNAWAY = 10.0  # in xi, eta: no root inside is reached from so far outside
-_NEARLY_PX = 1e-7  # so near, the next step ends at rounding: convergence is quadratic
-_DEEPEST = 9  # quarters of quarters in the exhaustive search
+_SETTLED = 1e-8  # in xi, eta: convergence is quadratic, so the error after this step is rounding
+_RUNAWAY = 10.0  # in xi, eta: from so far outside, no root inside is reached
+_NEARLY_PX = 1e-7  # residual from which the next step reaches rounding (quadratic convergence)
+_DEEPEST = 9  # levels of subdivision in the exhaustive search
 
 
 @compiled(inline=True)
 def coefficients(a: FloatArray) -> Coefficients:
-    """Keep a polynomial (9,) in registers; as an array it might overlap what is written."""
+    """Copy a polynomial (9,) to registers: the compiler can't exclude that arrays alias."""
     return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]
 
 
 @compiled(inline=True, relaxed=True)
 def value(a: Coefficients, curved: bool, s: float, t: float) -> float:
-    """Evaluate a polynomial; ``curved``: it has terms of third and fourth degree."""
+    """Evaluate a polynomial; ``curved``: it has terms of total degree 3 and 4."""
     p = a[0] + s * (a[1] + s * a[3] + t * a[4]) + t * (a[2] + t * a[5])
     if curved:
         p += s * t * (s * a[6] + t * a[7] + s * t * a[8])
@@ -67,14 +67,14 @@ def value_and_slopes(
 def distance_px(
     x: Coefficients, y: Coefficients, curved: bool, s: float, t: float, at: tuple[float, ...]
 ) -> float:
-    """Distance of the mapped (s, t) from a pixel in the physical plane; ``at``: x, y, size [mm]."""
+    """Distance [px] of the mapped (s, t) from a pixel; ``at``: x, y, pixel size [mm]."""
     right, down = at[0] - value(x, curved, s, t), at[1] - value(y, curved, s, t)
     return float(np.sqrt(down * down + right * right) / at[2])
 
 
 @compiled(inline=True)
 def outside(triangular: bool, s: float, t: float) -> float:
-    """How far (s, t) lies outside the reference domain; 0 or negative inside."""
+    """Distance of (s, t) outside the reference domain; 0 or negative inside."""
     if triangular:
         return max(-s, -t, s + t - 1.0)
     return max(abs(s), abs(t)) - 1.0
@@ -85,7 +85,7 @@ def invert(
     polynomial: FloatArray, triangular: bool, affine: bool, row: FloatArray, col: FloatArray,
     s: FloatArray, t: FloatArray, count: int,
 ) -> None:  # fmt: skip
-    """Solve position(s, t) = (row, col) for ``count`` pixels from s, t; it may be wrong."""
+    """Solve position(s, t) = (row, col) for ``count`` pixels from s, t; may not converge."""
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
     curved = not triangular
     for _ in range(1 if affine else _BATCH_STEPS):
@@ -107,7 +107,7 @@ def invert(
 def newton(
     a: Coefficients, b: Coefficients, curved: bool, row: float, col: float, s: float, t: float
 ) -> tuple[bool, float, float]:
-    """Solve position(s, t) = (row, col) for one pixel from a start; (converged, s, t)."""
+    """Solve position(s, t) = (row, col) for one pixel; return (converged, s, t)."""
     for _ in range(_NEWTON_STEPS):
         p, p_s, p_t = value_and_slopes(a, curved, s, t)
         q, q_s, q_t = value_and_slopes(b, curved, s, t)
@@ -129,7 +129,7 @@ def newton(
 def _may_hold(
     a: FloatArray, bezier: FloatArray, s: float, t: float, scale: float, row: float, col: float
 ) -> bool:
-    """Whether the control points' box of the part (s, t) + scale (s', t') holds the pixel."""
+    """Whether the control points' box of the part (s, t) + scale (s', t') contains the pixel."""
     b = np.empty(9)
     for k in range(2):
         c = a[k]
@@ -163,7 +163,7 @@ def search(
     polynomial: FloatArray, bezier: FloatArray, quarters: FloatArray, triangular: bool, row: float,
     col: float,
 ) -> tuple[bool, float, float]:  # fmt: skip
-    """Exhaustive search: halve the element, drop parts that can't hold the pixel, try the rest."""
+    """Exhaustive search: subdivide, drop parts that exclude the pixel, try Newton in the rest."""
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
     stack = np.empty((4 * _DEEPEST + 4, 4))
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0.0, 0.0, 1.0, 0.0
@@ -190,17 +190,17 @@ def search(
 End = tuple[float, float, float]
 """Column relative to the element's centre [px], and the local coordinates there."""
 
-_CLOSE_PX = 1e-6  # rows that miss a side or a corner by less meet it; pixels are looked at anyway
-_CLOSE = 1e-6  # the same along a side
-_FLAT_PX = 1e-3  # straight sides that are lower: a row that misses their end by rounding is near
+_CLOSE_PX = 1e-6  # a row that misses a side or corner by less meets it; pixels are checked later
+_CLOSE = 1e-6  # the same tolerance for the parameter along a side
+_FLAT_PX = 1e-3  # straight sides with a smaller extent in rows are treated as parallel to rows
 _FAR_PX = 1e9
 
 
 @compiled(inline=True, relaxed=True)
 def ends(sides: FloatArray, corners: FloatArray, row: float) -> tuple[End, End]:
-    """Where a row (relative to the centre [px]) first and last meets the element's sides.
+    """First and last intersection of a row (relative to the centre [px]) with the sides.
 
-    The first column is infinite if it doesn't. For ``sides`` and ``corners`` see Elements.
+    The first column is infinite if there is none. ``sides``, ``corners``: see ElementTable.
     """
     low, low_at, high, high_at = np.inf, 0.0, -np.inf, 0.0
     for side in range(sides.shape[0]):
@@ -209,8 +209,8 @@ def ends(sides: FloatArray, corners: FloatArray, row: float) -> tuple[End, End]:
         corner = 0.0 if abs(c0) <= _CLOSE_PX else np.nan
         for at in (u, v, corner):
             col = sides[side, 1, 0] + at * (sides[side, 1, 1] + at * sides[side, 1, 2])
-            # Which root counts is hard to predict, so there are selections instead of branches.
-            on_side = (at >= -_CLOSE) & (at <= 1.0 + _CLOSE)  # NaN isn't
+            # Selections instead of branches: which root counts is hard to predict.
+            on_side = (at >= -_CLOSE) & (at <= 1.0 + _CLOSE)  # False for NaN
             lower, higher = on_side & (col < low), on_side & (col > high)
             low, low_at = col if lower else low, side + at if lower else low_at
             high, high_at = col if higher else high, side + at if higher else high_at
@@ -219,24 +219,24 @@ def ends(sides: FloatArray, corners: FloatArray, row: float) -> tuple[End, End]:
 
 @compiled(inline=True, relaxed=True)
 def straight_ends(sides: FloatArray, row: float) -> tuple[End, End]:
-    """Where a row meets an element whose sides are straight: between the lines that these lie on.
+    """Intersections of a row with an element with straight sides, from the lines through them.
 
-    Only the columns are given. The row is one of the element's own, so that sides along it, which
-    say nothing about columns, needn't be looked at.
+    Only the columns are computed. The row must intersect the element; sides parallel to the row
+    don't bound the columns and are skipped.
     """
     low, high = -_FAR_PX, _FAR_PX
     for side in range(sides.shape[0]):
         down = sides[side, 0, 1]
         if abs(down) > _FLAT_PX:
             col = sides[side, 1, 0] + (row - sides[side, 0, 0]) * (sides[side, 1, 1] / down)
-            # Nodes are counter-clockwise: the left side leads down.
+            # Nodes are counter-clockwise: sides on the left lead down.
             low, high = max(low, col if down > 0.0 else low), min(high, high if down > 0.0 else col)
     return (low, 0.0, 0.0), (high, 0.0, 0.0)
 
 
 @compiled(inline=True, relaxed=True)
 def _end(corners: FloatArray, col: float, at: float) -> End:
-    """``at`` is the number of the side plus the parameter along it."""
+    """Column and local coordinates of an end; ``at``: side number plus parameter along it."""
     whole = np.floor(at)
     side, after = int(whole) % len(corners), (int(whole) + 1) % len(corners)
     u = at - whole
@@ -247,7 +247,7 @@ def _end(corners: FloatArray, col: float, at: float) -> End:
 
 @compiled(inline=True, relaxed=True)
 def _roots(a: float, b: float, c: float) -> tuple[float, float]:
-    """Roots of a u^2 + b u + c, NaN where there is none; c may be off by _CLOSE_PX."""
+    """Roots of a u^2 + b u + c, NaN where there is none; tolerance of c: _CLOSE_PX."""
     if a == 0.0:
         return -c / b, np.nan
     discriminant = b * b - 4.0 * a * c
@@ -264,7 +264,7 @@ def start_cubic(
     polynomial: FloatArray, curved: bool, low: End, high: End, col: float, s: FloatArray,
     t: FloatArray,
 ) -> None:  # fmt: skip
-    """Start for the pixels col, col + 1, ... of a row between its two ends."""
+    """Initial guesses for the pixels col, col + 1, ... of a row between its two ends."""
     length = max(high[0] - low[0], 1e-3)
     ds_low, dt_low = _along_row(polynomial, curved, low[1], low[2])
     ds_high, dt_high = _along_row(polynomial, curved, high[1], high[2])
@@ -289,5 +289,5 @@ def _along_row(polynomial: FloatArray, curved: bool, s: float, t: float) -> tupl
 
 @compiled(inline=True, relaxed=True)
 def _hermite(y0: float, y1: float, d0: float, d1: float) -> tuple[float, float, float]:
-    """Coefficients of x, x^2, x^3 of the cubic from y0 with slope d0 at 0 to y1, d1 at 1."""
+    """Coefficients of x, x^2, x^3 of the cubic with value y0, slope d0 at 0 and y1, d1 at 1."""
     return d0, 3.0 * (y1 - y0) - 2.0 * d0 - d1, 2.0 * (y0 - y1) + d0 + d1

@@ -1,14 +1,14 @@
-"""The inverse isoparametric mapping: which element covers a pixel or a point, and where in it.
+"""The inverse isoparametric mapping: element and local coordinates at a pixel or point.
 
 For each position x, find the element e and the local coordinates xi with sum_a N_a(xi) x_a = x,
 where x_a are the element's node positions in the state the image shows. The paper inverts the same
 mapping to make its virtual images (section "Virtual Experiments").
 
 :func:`locate` fills a regular grid of pixels element by element. :func:`locate_points` finds the
-element for each of many scattered points, as a lens shows them at its pixels: the plane is cut into
-buckets that list the elements reaching into them; an element that may hold a point by its Bézier
-control points' box is inverted by Newton's method, and only where no element is found to hold the
-point, exhaustively.
+elements of scattered points, such as those that pixels show through a lens: the plane is divided
+into buckets that list the elements reaching into them. For an element whose bounding box of Bézier
+control points contains the point, the mapping is inverted by Newton's method. An exhaustive search
+follows only if no element is found this way.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Every pixel of an image in terms of a mesh."""
+    """Element and local coordinates, or nodal fields, at every pixel of an image."""
 
     element: NDArray[np.int32]
     """(rows, cols) int32 number of the element that covers the pixel centre, -1 where none does. A
-    pixel on a shared edge or node belongs to the element of the lowest number."""
+    pixel on a shared edge or node belongs to the element with the lowest number."""
     values: FloatArray
     """(c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi, eta)
-    there [-]; NaN where no element is."""
+    there [-]; NaN outside the mesh."""
     residual_px: NDArray[np.float32]
     """(rows, cols) float32 distance of the mapped (xi, eta) from the pixel [px], or NaN."""
     doubly_covered: int = 0
-    """How many pixels lie inside more than one element: the mesh overlaps there."""
+    """Number of pixels inside more than one element, where the mesh overlaps itself."""
 
     @property
     def mask(self) -> BoolArray:
@@ -65,7 +65,7 @@ class Located:
 
     @property
     def xi(self) -> FloatArray:
-        """(rows, cols, 2) local coordinates, where these were asked for."""
+        """(rows, cols, 2) local coordinates; valid only if located without ``nodal`` fields."""
         return np.moveaxis(self.values, 0, -1)
 
     @property
@@ -91,8 +91,8 @@ def locate(
     cells, element : (m, k) node numbers of each element; T3, T6, Q4, Q8 or Q9.
     grid : the pixels.
     where : what to call the mesh in an error.
-    nodal : (n, c) fields at the nodes to evaluate instead of the local coordinates: faster than
-        :func:`interpolate` later, and without the memory for those.
+    nodal : (n, c) nodal fields to evaluate instead of the local coordinates: faster than
+        :func:`interpolate` afterwards, and needs no memory for the local coordinates.
     """
     require_positive_jacobian(nodes, cells, element, where)
     elements = tabulate_elements(nodes, cells, element, grid)
@@ -113,7 +113,7 @@ def locate(
 
 
 def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArray) -> FloatArray:
-    """(c, rows, cols) values of a nodal field (n, c) at located pixels, NaN off the material.
+    """(c, rows, cols) values of a nodal field (n, c) at located pixels, NaN outside the mesh.
 
     ``located`` is from :func:`locate` with the same cells. InputError unless the field is (n, c).
     """
@@ -127,24 +127,24 @@ def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArr
 
 
 _BUCKET_PX = 16
-_BLOCK = 1024  # points that one thread takes at a time
+_BLOCK = 1024  # number of points that a thread processes at a time
 _SLACK_PX = 1e-7
 
 
 class _Buckets(NamedTuple):
-    """Which elements may hold the points of a square of the image plane."""
+    """A grid of square buckets over the image plane, and the elements that reach into each."""
 
     boxes: FloatArray
-    """(m, 4) each element's least row and column, greatest row and column [px]."""
+    """(m, 4) each element's smallest row and column, largest row and column [px]."""
     start: IntArray
     members: IntArray
     """members[start[b]:start[b + 1]] are the elements of bucket b, ascending."""
     top: float
     left: float
-    """Where the first bucket begins [px]."""
+    """Upper left corner of the first bucket (row, col) [px]."""
     rows: int
     cols: int
-    """How many buckets."""
+    """Number of buckets along each axis."""
 
 
 def locate_points(
@@ -153,11 +153,11 @@ def locate_points(
 ) -> Located:  # fmt: skip
     """Find element and local coordinates of points given by their image positions.
 
-    Points beside the mesh, and NaN, belong to no element; how many lie inside more than one is not
-    counted. InputError if a Jacobian isn't positive everywhere in some element.
+    Points outside the mesh, and NaN, belong to no element. Points inside more than one element are
+    not counted. InputError if a Jacobian isn't positive everywhere in some element.
 
     nodes, cells, element, where : as for :func:`locate`.
-    grid : what positions in px mean; they need not lie on it.
+    grid : defines the px coordinates of the points, which need not be pixel centres.
     row, col : positions of the points [px], of shapes that broadcast to two dimensions.
     """
     require_positive_jacobian(nodes, cells, element, where)
@@ -168,7 +168,7 @@ def locate_points(
     frame = (float(grid.x0), float(grid.y0), float(grid.pixel_size))
     points = (np.ascontiguousarray(row).ravel(), np.ascontiguousarray(col).ravel())
     in_parallel(_locate, elements, _buckets(elements), *points, frame, owner, xi, residual)
-    # In memory as locate leaves it, or kernels are compiled for either.
+    # Same memory layout as from locate, so that kernels are compiled only once.
     shape, values = row.shape, np.ascontiguousarray(xi.T).reshape(2, *row.shape)
     return Located(owner.reshape(shape), values, residual.reshape(shape))
 
@@ -191,7 +191,7 @@ def _locate(
     frame: tuple[float, float, float], owner: NDArray[np.int32], xi: FloatArray,
     residual: NDArray[np.float32], thread: int, threads: int,
 ) -> None:  # fmt: skip
-    """Fill owner, xi and residual; a thread writes its own points only."""
+    """Fill owner, xi and residual; each thread writes only its own points."""
     x0, y0, h = frame
     for block in range(thread, (row.size + _BLOCK - 1) // _BLOCK, threads):
         for k in range(block * _BLOCK, min((block + 1) * _BLOCK, row.size)):

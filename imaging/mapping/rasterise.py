@@ -1,12 +1,12 @@
-"""Compiled kernels: which element covers a pixel, and fields there.
+"""Compiled kernels: the element that covers each pixel, and fields there.
 
-The image is cut into bands of rows. A band visits, in ascending order, the elements that reach
-into it, and writes its own pixels only: no races, and the same result for any number of
-threads. Within an element, a row's pixels are limited to those between its two ends on the
-element's sides, however curved. They are collected over the rows and inverted together.
+The image is divided into bands of rows. Each band visits, in ascending order, the elements that
+reach into it, and writes only its own pixels: there are no races, and the result is the same for
+any number of threads. Within an element, a row's pixels lie between the row's two intersections
+with the (possibly curved) sides. They are collected over the rows and inverted together.
 
 Coordinates are (row, col) in px relative to the element's centre, a whole number of pixels, so
-rounding is that of the element's size and not of the image's.
+that rounding errors scale with the element's size and not with the image's.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
 
 BAND = 32  # rows
-_BATCH = 1024  # pixels that are inverted together; their work fits into the fastest cache
-_MARGIN_PX = 1e-3  # beyond a row's ends; these are found much more closely
+_BATCH = 1024  # pixels inverted together; their work arrays fit into the fastest cache
+_MARGIN_PX = 1e-3  # margin beyond a row's ends, whose error is much smaller
 
 
 class Batch(NamedTuple):
-    """Pixels of one element on their way through the kernels: arrays of equal length."""
+    """Work arrays, of equal length, for pixels of one element."""
 
     row: FloatArray
     col: FloatArray
-    """Relative to the element's centre [px]."""
+    """Position relative to the element's centre [px]."""
     s: FloatArray
     t: FloatArray
     """Local coordinates."""
     off: FloatArray
-    """Squared residual in the kernels' own coordinates [px^2]."""
+    """Squared residual, from ``ElementTable.polynomials`` [px^2]."""
     residual: FloatArray
-    """Distance in the physical plane, by the nodes' own coordinates [px]."""
+    """Residual, from ``ElementTable.absolute``: node coordinates in mm [px]."""
     where: IntArray
-    """Place among the pixels."""
+    """Index into the arrays of ``Pixels``."""
 
 
 @compiled()
@@ -73,8 +73,8 @@ def rasterise(
     """Fill ``pixels``, a whole image, and count those that lie inside more than one element.
 
     ``fields`` (m, c, 9) are polynomials over the elements; without any (c = 0) the values are
-    the local coordinates. The elements of band b are ``visits[start[b]:start[b + 1]]``, and the
-    pixels of it that were counted ``overlapping[b]``. A thread has bands from every part.
+    the local coordinates. The elements of band b are ``visits[start[b]:start[b + 1]]``; the
+    count of band b is ``overlapping[b]``. Each thread's bands are spread over the image.
     """
     rows = pixels.element.size // pixels.cols
     everywhere = np.empty(0, dtype=np.bool_)
@@ -89,10 +89,10 @@ def fill(
     elements: ElementTable, fields: FloatArray, pixels: Pixels, selected: BoolArray,
     visited: IntArray, top: int, bottom: int,
 ) -> int:  # fmt: skip
-    """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many lie in two elements.
+    """Fill the image rows ``top`` ... ``bottom`` - 1; return how many pixels lie in two elements.
 
-    That is counted with residuals alone. ``selected`` (n,) tells of a whole image's pixels where to
-    look; everywhere if it is empty.
+    They are only counted if residuals are computed. ``selected`` (n,): which pixels of the whole
+    image to fill; all if it is empty.
     """
     begin, end = (top - pixels.first_row) * pixels.cols, (bottom - pixels.first_row) * pixels.cols
     state = np.zeros(end - begin, dtype=np.uint8)
@@ -105,7 +105,7 @@ def fill(
                   np.empty(_BATCH, dtype=np.int64))  # fmt: skip
     rows_, cols_, s, t, where = batch.row, batch.col, batch.s, batch.t, batch.where
     cols, first_row, corners = pixels.cols, pixels.first_row, elements.corners
-    # Here and not in a kernel of its own, which would count references to all arrays each time.
+    # Inlined here: a separate kernel would count references to all arrays at each call.
     for e in visited:
         centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
         polynomial, sides, affine = elements.polynomials[e], elements.sides[e], elements.affine[e]
@@ -130,14 +130,14 @@ def fill(
                 n, col_from = stop - col, float(col - centre_col)
                 for k in range(count, count + n):
                     rows_[k], cols_[k], where[k] = row, col_from + (k - count), at + col + k - count
-                    s[k] = t[k] = 0.0  # from where Newton's method solves an affine map at once
+                    s[k] = t[k] = 0.0  # for an affine map one Newton step from here is exact
                 if not affine:
                     start_cubic(polynomial, not elements.triangular, low, high, col_from,
                                 s[count : count + n], t[count : count + n])  # fmt: skip
                 count, col = count + n, stop
         _assign(elements, fields, pixels, e, state, begin, batch, count)
     overlapping = 0
-    if pixels.residual.size:  # else these pixels are on their way elsewhere
+    if pixels.residual.size:  # else the caller handles pixels outside the mesh
         for k in range(state.size):
             overlapping += state[k] == OVERLAPPING
             if pixels.element[begin + k] < 0:
@@ -151,21 +151,21 @@ def _assign(
     elements: ElementTable, fields: FloatArray, pixels: Pixels, e: int, state: NDArray[np.uint8],
     begin: int, batch: Batch, count: int,
 ) -> None:  # fmt: skip
-    """Invert a batch; assign those of its pixels that are inside and still unassigned."""
+    """Invert a batch; assign its pixels that are inside the element and not assigned yet."""
     polynomial, triangular = elements.polynomials[e], elements.triangular
     row, col, s, t, off, residual, where = batch
     element, residuals = pixels.element, pixels.residual
     invert(polynomial, triangular, elements.affine[e], row, col, s, t, count)
     _check(elements, pixels, e, row, col, s, t, off, residual, count)
-    reach = np.inf if elements.affine[e] else np.nan  # it is proved when first needed
+    reach = np.inf if elements.affine[e] else np.nan  # NaN: not computed yet
     assigned = 0
     for k in range(count):
         depth = -outside(triangular, s[k], t[k])
         if depth < -ON_EDGE and np.isnan(reach):
             reach = proved_reach(polynomial, elements.slopes, elements.middle)
         if off[k] > ACCEPTED_PX**2 or (depth < -ON_EDGE and depth <= -reach):
-            # A root found outside, where the map is still one to one, is the only one; here
-            # there may be another inside.
+            # A root outside is the only one where the map is proved one to one. Beyond that
+            # region there may be another root inside.
             found, s[k], t[k] = search(
                 polynomial, elements.bezier, elements.quarters, triangular, row[k], col[k]
             )
@@ -193,7 +193,7 @@ def _check(
     elements: ElementTable, pixels: Pixels, e: int, row: FloatArray, col: FloatArray, s: FloatArray,
     t: FloatArray, off: FloatArray, residual: FloatArray, count: int,
 ) -> None:  # fmt: skip
-    """Compute the residuals of the first ``count`` pixels, two ways: see Batch."""
+    """Compute ``off`` and ``residual`` of the first ``count`` pixels, see Batch."""
     curved = not elements.triangular
     a = coefficients(elements.polynomials[e, 0])
     b = coefficients(elements.polynomials[e, 1])
@@ -234,7 +234,7 @@ def evaluate(
 ) -> None:  # fmt: skip
     """Write a field's polynomials (m, c, 9) at located pixels to ``out`` (c, rows, cols).
 
-    ``xi`` (rows, cols, 2) may lie in memory in any order.
+    ``xi`` (rows, cols, 2) may have any memory layout.
     """
     cols = element.shape[1]
     for row in range(thread, element.shape[0], threads):

@@ -1,4 +1,4 @@
-"""Contours in photographs: smooth curves, the distance of points from them, shapes of holes."""
+"""Contours in photographs: smooth curves, distances of points from them, shapes of holes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 
 _FINE_PX = 0.25
-"""Between the points of a contour among which the nearest is sought."""
+"""Spacing of the trial points for the nearest point, relative to that of the contour's points."""
 
 
 def signed_area(points: FloatArray) -> float:
-    """Of a polygon (n, 2): positive where x, y go around it anticlockwise."""
+    """Signed area of a polygon (n, 2): positive if its points run anticlockwise (x right, y up)."""
     after = np.roll(points, -1, axis=0)
     return 0.5 * float(np.sum(points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]))
 
@@ -38,7 +38,7 @@ class Contour:
 
     @cached_property
     def moments(self) -> tuple[float, FloatArray, FloatArray]:
-        """Signed area [mm^2], centroid (2,) [mm], second central moments (2, 2) over it [mm^2]."""
+        """Signed area [mm^2], centroid (2,) [mm], second central moments (2, 2) / area [mm^2]."""
         p, q = self.points, np.roll(self.points, -1, axis=0)
         cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
         area = signed_area(p)
@@ -50,26 +50,26 @@ class Contour:
         return area, np.asarray(centre, np.float64), np.asarray(second / (24.0 * area))
 
     def evenly(self, step: float) -> tuple[FloatArray, float]:
-        """Points (n, 2) about so far apart along the curve, at least 16, and their distance."""
+        """(n, 2) equidistant points on the curve, n >= 16, about ``step`` apart; their spacing."""
         count = max(16, round(self.length / step))
         step = self.length / (count if self.closed else count - 1)
         return self._curve(np.arange(count) * step), step
 
     def _dense_lengths(self) -> FloatArray:
-        """(k,) arc lengths [mm], from which the nearest point of the curve is found."""
+        """(k,) arc lengths [mm] of the trial points for the nearest point of the curve."""
         step = _FINE_PX * self.length / len(self.points)
         count = int(self.length / step)
         return np.linspace(0.0, self.length, count, endpoint=not self.closed, dtype=np.float64)
 
 
 class Contours:
-    """Several contours, from one of which each point's distance is asked for: all at once."""
+    """Several contours, to compute at once the distance of each point from its contour."""
 
     def __init__(self, contours: Sequence[Contour]) -> None:
         self.length = np.array([contour.length for contour in contours])
         self.is_cut = np.array([not contour.closed for contour in contours])
         self.step = self.length / [len(contour.points) for contour in contours]
-        # The arc lengths s of all contours follow one another, with gaps.
+        # All contours share one arc-length axis s, one after the other with gaps between them.
         self._begin = 2.0 * np.cumsum(self.length) - self.length
         curves, fine = [c._curve for c in contours], [c._dense_lengths() for c in contours]
         pairs = zip(self._begin, curves, strict=True)
@@ -82,21 +82,21 @@ class Contours:
         self._tree = cKDTree(self._separated(points, number))
 
     def _separated(self, x: FloatArray, number: IntArray) -> FloatArray:
-        """(n, 3) points (n, 2), those of different contours far from each other."""
+        """(n, 3) points x (n, 2) with a third coordinate that separates different contours."""
         return np.column_stack([x, self._far * number])
 
     def _at(self, s: FloatArray, number: IntArray) -> tuple[FloatArray, ...]:
-        """(n, 2) points of the contours, and their first and second derivatives by s."""
+        """(n, 2) points of the contours at arc length s, and first and second derivatives by s."""
         at = self._begin[number] + s
         piece = np.searchsorted(self._knots, at, "right") - 1
         (a, b, c, d), t = self._coefficients[:, piece], (at - self._knots[piece])[:, None]
         return ((a * t + b) * t + c) * t + d, (3.0 * a * t + 2.0 * b) * t + c, 6.0 * a * t + 2.0 * b
 
     def distance(self, x: FloatArray, number: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """(n,) signed distance of points (n, 2) from their contours [mm], (n, 2) its gradient.
+        """(n,) signed distance of points x (n, 2) from their contours [mm]; (n, 2) its gradient.
 
-        Where the third, (n,), is True that from the tangent beyond the end of one that is cut.
-        ``number`` (n,): of each point's contour.
+        Third, (n,) True where the point lies beyond the end of an open contour: the distance is
+        from the tangent there. ``number`` (n,): index of each point's contour.
         """
         s = self._fine[self._tree.query(self._separated(x, number))[1]]
         step, length, is_cut = self.step[number], self.length[number], self.is_cut[number]
@@ -116,38 +116,38 @@ class Contours:
 
 @dataclass(frozen=True, eq=False)
 class SeenContours:
-    """Contours of one and the same edges in two images."""
+    """Contours of the same edges in a reference and a deformed image."""
 
     reference: tuple[Contour, ...]
     deformed: tuple[Contour, ...]
-    """One after the other, gone along in the same sense [mm]."""
+    """Contours in corresponding order, traversed in the same sense [mm]."""
     noise: float
-    """Variance of their distance times the length over which it is correlated [mm^3]."""
+    """Variance of the contours' distance times its correlation length [mm^3]."""
     correlated: float
-    """That length [mm]."""
+    """Correlation length of that noise [mm]."""
     dots: tuple[tuple[Contour, Contour], ...] = ()
-    """Around marks on the material, in the reference and in the deformed image [mm]."""
+    """Contours of marks on the material, in the reference and in the deformed image [mm]."""
     is_part: bool = False
-    """Whether the reference's border cuts the body."""
+    """Whether the border of the reference image cuts the body."""
 
 
 @dataclass(frozen=True)
 class HoleShape:
-    """A hole's shape, by the moments of its contour."""
+    """A hole's shape, from the moments of its contour."""
 
     x: float
     y: float
-    """Its centre [mm]."""
+    """Centroid [mm]."""
     area: float
-    """[mm^2]."""
+    """Area [mm^2]."""
     ellipticity: float
-    """1 less the ratio of the ellipse's axes that has the same second moments [-]."""
+    """1 - b / a, with b / a the axes' ratio of the ellipse with the same second moments [-]."""
     orientation_deg: float
-    """Of the longer axis, from x, anticlockwise, -90 to 90 [degrees]."""
+    """Angle from x to the longer axis, anticlockwise, -90 to 90 [degrees]."""
 
     @classmethod
     def of(cls, contour: Contour) -> HoleShape:
-        """Of a contour [mm]."""
+        """The shape of a contour [mm]."""
         area, (x, y), second = contour.moments
         values, vectors = np.linalg.eigh(second)
         along = vectors[:, 1] * np.sign(vectors[0, 1] or 1.0)

@@ -1,8 +1,8 @@
-"""Image files: the numbers that are stored, right side up; masks and grey images; TIFF written.
+"""Image files: stored levels in upright orientation, masks, grey images, writing of TIFF.
 
-TIFF is read by tifffile, which keeps 16-bit colour; its compressions that tifffile leaves to others
-(LZW, JPEG, ...) are read by Pillow where that loses nothing, as are PNG and JPEG. Files are checked
-on the way in, and whole or absent on the way out.
+TIFF is read by tifffile, which keeps 16-bit colour. TIFF compressions that tifffile can't decode
+alone (LZW, JPEG, ...) are read by Pillow if that is lossless, as are PNG and JPEG. Files are
+checked when read, and written atomically.
 
 Colour becomes grey by luma, 0.2125 R + 0.7154 G + 0.0721 B (ITU-R BT.709, as in scikit-image).
 """
@@ -29,10 +29,10 @@ LUMA = (0.2125, 0.7154, 0.0721)
 """Weights of red, green and blue in a grey level."""
 _TIFF = {".tif", ".tiff"}
 _LABELS = 16
-"""Levels of a mask with soft edges, at least, where most of it is white; others are labels."""
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it would print beside our line
+"""A mostly white mask with more levels than this has soft edges; otherwise levels are labels."""
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # no output beside our messages
 _ORIENTATION = 274
-"""The tag of TIFF and of Exif."""
+"""Number of the orientation tag in TIFF and Exif."""
 _TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -46,22 +46,22 @@ _TURNS = {
 
 @dataclass(frozen=True, eq=False)
 class StoredImage:
-    """What a file holds."""
+    """Content of an image file."""
 
     levels: NDArray[Any]
-    """(rows, cols), or (rows, cols, 3) colour."""
+    """(rows, cols) grey levels, or (rows, cols, 3) colour."""
     notes: tuple[str, ...]
-    """What was changed."""
+    """Texts about changes made when it was read."""
 
     @property
     def grey(self) -> NDArray[Any]:
-        """(rows, cols) floating-point levels; integers as fractions of full scale."""
+        """(rows, cols) floating-point grey levels; integers become fractions of full scale."""
         whole = self.levels.dtype.kind == "u"
         return luma(self.levels / (float(np.iinfo(self.levels.dtype).max) if whole else 1.0))
 
 
 def luma(levels: NDArray[Any]) -> NDArray[Any]:
-    """(rows, cols) grey levels of floating-point grey or colour ones."""
+    """(rows, cols) grey levels from floating-point grey or colour levels."""
     if levels.ndim == 2:
         return levels
     return np.asarray(levels @ np.asarray(LUMA, dtype=levels.dtype))
@@ -70,13 +70,13 @@ def luma(levels: NDArray[Any]) -> NDArray[Any]:
 def read_stored(path: Path, *, single: bool = False) -> StoredImage:
     """Read a TIFF, PNG or JPEG; an alpha channel is dropped.
 
-    Of a file with several pages the first is taken, unless it has to be the ``single`` one.
-    InputError if the file is missing, empty, damaged, or its numbers can't be read unchanged.
+    The first page of a multi-page file is read, unless ``single``, which allows only one page.
+    InputError if the file is missing, empty, damaged, or its levels can't be read unchanged.
     """
     remedy = "if it is a damaged file, or cut short, copy it or make it again"
     with reading(path, "a TIFF, PNG or JPEG image", remedy), warnings.catch_warnings():
-        warnings.simplefilter("error")  # how Pillow tells of files cut short
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # its size is looked at
+        warnings.simplefilter("error")  # Pillow warns of files cut short
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # size is checked here
         is_tiff = path.suffix.lower() in _TIFF
         stored = _read_tiff(path, single) if is_tiff else _read_other(path, single)
         levels = stored.levels
@@ -95,7 +95,7 @@ def _not_plane(shape: tuple[int, ...], path: Path) -> InputError:
 
 
 def require_grey_levels(levels: NDArray[Any], path: Path | str) -> None:
-    """Raise InputError for numbers of a type that has no full scale, or is no camera's."""
+    """Raise InputError for a type of numbers without full scale, or that no camera stores."""
     if levels.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         what = f"8-bit, 16-bit or float grey levels at {path}"
         raise InputError(f"expected {what}, got {levels.dtype}; convert it to one of them")
@@ -104,7 +104,7 @@ def require_grey_levels(levels: NDArray[Any], path: Path | str) -> None:
 def require_visible(grey: NDArray[Any], where: str) -> None:
     """Raise InputError for grey levels with NaN or infinity, or all equal.
 
-    ``where`` they are: "at PATH", "in the reference image".
+    ``where``: text for the message, such as "at PATH" or "in the reference image".
     """
     count = int(np.count_nonzero(~np.isfinite(grey)))
     if count:
@@ -129,7 +129,7 @@ def _read_tiff(path: Path, single: bool) -> StoredImage:
             if "imagecodecs" not in str(error) and not isinstance(error, ImportError):
                 raise
             return _by_pillow(path, page, notes)
-        if page.axes == "SYX":  # colours one after the other
+        if page.axes == "SYX":  # planar colour: channels first
             levels = np.moveaxis(levels, 0, -1)
         if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and levels.dtype.kind == "u":
             levels = np.iinfo(levels.dtype).max - levels
@@ -149,7 +149,7 @@ def _page_notes(count: int) -> list[str]:
 
 def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> StoredImage:
     if page.samplesperpixel > 1 and page.bitspersample != 8:
-        # Pillow would drop the lower bits without a word.
+        # Pillow would drop the lower bits without a warning.
         codec = tifffile.COMPRESSION(page.compression).name
         raise InputError(
             f"expected a TIFF that can be read unchanged at {path}, got {page.bitspersample}-bit "
@@ -183,7 +183,7 @@ def _from_pillow(picture: Image.Image, notes: list[str]) -> StoredImage:
         turned = turned.convert("L" if turned.mode == "1" else "RGB")
     levels = np.asarray(turned)
     if levels.dtype == np.int32 and levels.min() >= 0 and levels.max() < 2**16:
-        levels = levels.astype(np.uint16)  # how some versions hand out 16-bit grey PNG
+        levels = levels.astype(np.uint16)  # some versions return 16-bit grey PNG as int32
     return StoredImage(np.asarray(levels), tuple(notes))
 
 
@@ -198,7 +198,7 @@ def _turn_note(orientation: int) -> str:
 
 
 def _upright(levels: NDArray[Any], orientation: int) -> tuple[NDArray[Any], tuple[str, ...]]:
-    """Obey the orientation tag: 1 to 8, by which corner the first row and column start from."""
+    """Apply the orientation tag, 1 to 8: the corner where the first row and column start."""
     if orientation not in _TURNS:
         return levels, ()
     if orientation >= 5:
@@ -213,10 +213,10 @@ def _upright(levels: NDArray[Any], orientation: int) -> tuple[NDArray[Any], tupl
 def read_image(path: Path | str) -> NDArray[np.float32]:
     """Read a grey image.
 
-    Whole-number images are scaled to fractions of their type's full scale (uint8: /255,
-    uint16: /65535); floating-point images are taken as they are. Row 0 is at the top.
+    Integer images are scaled to fractions of their type's full scale (uint8: /255,
+    uint16: /65535); floating-point images are not scaled. Row 0 is at the top.
 
-    InputError if the file is missing, cut short, not one plane image of 8 or 16 bits or floats,
+    InputError if the file is missing, cut short, not a single image of 8 or 16 bits or floats,
     holds NaN or infinity, or all its pixels are equal.
     """
     stored = read_stored(Path(path), single=True)
@@ -229,9 +229,9 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
 def read_mask(path: Path | str) -> BoolArray:
     """Read a mask (rows, cols): True where the file isn't zero, that is, where there is material.
 
-    Of a white mask with soft edges, which have many levels, those above half of the largest count.
-    InputError if the file is missing, cut short, not one plane image, zero everywhere, of several
-    levels without zero, or holds NaN or infinity.
+    In a white mask with soft edges (many levels), levels above half the largest one are True.
+    InputError if the file is missing, cut short, not a single image, zero everywhere, has several
+    levels but no zero, or holds NaN or infinity.
     """
     levels = read_stored(Path(path), single=True).levels
     if not np.isfinite(levels).all():
@@ -251,7 +251,7 @@ def read_mask(path: Path | str) -> BoolArray:
 def require_same_shape(
     image: NDArray[Any], other: NDArray[Any], what: str, other_what: str
 ) -> None:
-    """Raise InputError unless two images, of these names, have the same size."""
+    """Raise InputError unless two images have the same size; ``what``: names for the message."""
     if image.shape != other.shape:
         size, other_size = (" x ".join(map(str, each.shape)) for each in (image, other))
         raise InputError(
@@ -261,10 +261,10 @@ def require_same_shape(
 
 
 def write_image(path: Path | str, image: NDArray[Any]) -> None:
-    """Write a float32, uint8 or uint16 image (rows, cols) as TIFF, whole or not at all.
+    """Write a float32, uint8 or uint16 image (rows, cols) as TIFF, atomically.
 
-    Values are stored as they are (float64 is rounded to float32); bool (a mask) as 0 and 255.
-    InputError if the name is not of a TIFF file, the image not plane, or of another type.
+    Values are stored unscaled (float64 is rounded to float32), bool (a mask) as 0 and 255.
+    InputError if the name isn't a TIFF file's, the image isn't 2-D, or has another type.
     """
     path = Path(path)
     if path.suffix.lower() not in _TIFF:
@@ -277,9 +277,9 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
         image = image.astype(np.float32)
     elif image.dtype not in (np.float32, np.uint8, np.uint16):
         raise InputError(f"expected float32, uint8 or uint16 for {path}, got {image.dtype}")
-    # In memory first: on a full disk it would say how many values it could not write, not why.
+    # In memory first: on a full disk tifffile's error message doesn't say why writing failed.
     memory = io.BytesIO()
     tifffile.imwrite(memory, image, photometric="minisblack")
     with atomic(path) as temporary:
-        # Not its buffer: memory that is lent to a failed write can't be freed.
+        # A copy, not the buffer: a buffer exported to a failed write can't be freed.
         temporary.write_bytes(memory.getvalue())

@@ -1,7 +1,7 @@
-"""Photographs as a camera leaves them: read, turned to grey, checked alone and as a series.
+"""Photographs from a camera: read, converted to grey, checked alone and as a series.
 
-Grey levels stay counts. Whole-number TIFF (8 and 16 bit, 10 to 14 bits stored in 16 included),
-float TIFF, PNG and JPEG are read; what was changed on the way is in ``Photograph.notes``.
+Grey levels stay counts. Integer TIFF (8 and 16 bits, including 10 to 14 bits stored in 16),
+float TIFF, PNG and JPEG are read; changes made when reading are in ``Photograph.notes``.
 """
 
 from __future__ import annotations
@@ -21,46 +21,46 @@ from modeharvest.util.errors import InputError
 MOSTLY = 0.5
 """Share of saturated or of black material above which a photograph is refused."""
 MANY = 0.01
-"""Share of saturated or of black material above which that is noted."""
+"""Share of saturated or of black material above which a note is added."""
 _BITS = (8, 10, 12, 14, 16)
 _NOISE_ONLY = 0.1
-"""Correlation of neighbouring pixels below which there is no speckle: speckles of 3 px have
-about 0.6, and n px of white noise have 1/sqrt(n)."""
+"""Correlation of neighbouring pixels below which there is no speckle. Speckle of 3 px has
+about 0.6; n px of white noise have 1/sqrt(n)."""
 _MEAN_PX = 31
-"""Lighting that is uneven over more than this is no pattern."""
+"""Width of the moving average that removes uneven lighting [px]."""
 _BLOCK_PX, _BLOCKY = 8, 1.5
-"""Edge of the blocks that are compressed by themselves, and from which on steps between them show
-over what is within: at most 1.2 without compression, 1.5 to 2.8 by JPEG of quality 50."""
+"""Edge of the compression blocks [px]; ratio of steps between blocks to those within, above which
+blocks are reported: at most 1.2 without compression, 1.5 to 2.8 for JPEG of quality 50."""
 _MUSH = (
     "Compression shows, as blocks of 8 x 8 px: errors are larger than error bars, which don't know "
     "of it; save photographs as TIFF or PNG, or as JPEG of quality 95."
 )
 _OTHER_SCALE = 4.0
-"""Ratio of two frames' bright levels from which on they can't be of one bit depth."""
+"""Ratio of two frames' bright levels from which on their bit depths must differ."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph in grey."""
+    """A photograph, converted to grey."""
 
     path: Path
-    """Its file."""
+    """The photograph's file."""
     image: FloatImage
-    """(rows, cols) grey levels as counts; of a float file as they are. Row 0 is the top."""
+    """(rows, cols) grey levels as counts (float files: as stored). Row 0 is at the top."""
     bits: int
     """Bits that the grey levels fill: 8, 10, 12, 14 or 16; 0 for floats."""
     stored_bits: int
-    """Bits of a number in the file: 8, 16, or 32 or 64 for floats."""
+    """Bits per value in the file: 8 or 16; 32 or 64 for floats."""
     full_scale: float
-    """The level that counts as white: 2^bits - 1; for floats 1, or the largest if above."""
+    """The white level: 2^bits - 1; for floats 1, or the largest level if above 1."""
     saturated: BoolArray
     black: BoolArray
-    """(rows, cols) True where a channel is at the level beyond which the camera or the file cuts
-    off, or at 0."""
+    """(rows, cols) ``saturated``: True where any channel is at the level where camera or file clip;
+    ``black``: True where all channels are at 0."""
     notes: tuple[str, ...] = ()
-    """Sentences about what was changed when it was read."""
+    """Texts about changes made when it was read."""
     warnings: tuple[str, ...] = ()
-    """Sentences about what makes errors larger."""
+    """Texts about properties that increase errors."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -69,23 +69,23 @@ class Photograph:
 
     @property
     def contrast(self) -> float:
-        """Standard deviation of the grey levels, as a share of full scale [-]."""
+        """Standard deviation of the grey levels, as a fraction of full scale [-]."""
         return float(self.image.std(dtype=np.float64) / self.full_scale)
 
 
 def read_photograph(path: Path | str) -> Photograph:
     """Read a photograph.
 
-    Of a file with several pages the first is taken, and the orientation tag is obeyed; ``notes``
-    tell of it. InputError, in one line that names the file: it is missing, damaged, not a picture
-    of grey or colour levels, holds NaN or infinity, or every pixel has the same level.
+    The first page of a multi-page file is read and the orientation tag applied, which ``notes``
+    records. InputError, in one line that names the file, if it is missing, damaged, has no grey or
+    colour levels, holds NaN or infinity, or every pixel has the same level.
     """
     stored = files.read_stored(Path(path))
     files.require_grey_levels(stored.levels, path)
     levels = stored.levels
-    if levels.ndim == 3 and (levels == levels[..., :1]).all():  # grey, stored as colour
+    if levels.ndim == 3 and (levels == levels[..., :1]).all():  # a grey image stored as colour
         levels = levels[..., 0]
-    with np.errstate(over="ignore"):  # what is infinite then is refused
+    with np.errstate(over="ignore"):  # infinite values are refused later
         image = np.ascontiguousarray(files.luma(levels.astype(np.float32)))
     files.require_visible(image, f"at {path}")
     bits, full_scale = _scale(levels)
@@ -102,11 +102,11 @@ def read_photograph(path: Path | str) -> Photograph:
 
 
 def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tuple[str, ...]:
-    """Check whether a photograph shows a pattern at all; notes about what is not that good.
+    """Check whether a photograph shows a pattern; return notes about minor defects.
 
-    ``mask`` (rows, cols) is True on material, if that is known: a background may be as white or
-    black as it likes. InputError if more than half of the material (without a mask: more than 95 %
-    of the image) is saturated or black, or if there is nothing but noise.
+    ``mask`` (rows, cols): True on material, if known; the background may then have any level.
+    InputError if more than half of the material (without a mask: more than 95 % of the image) is
+    saturated, or black, or if the photograph shows only noise.
     """
     notes = []
     area, most = ("image", 0.95) if mask is None else ("material", MOSTLY)
@@ -133,7 +133,7 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
 
 
 def require_alike(reference: Photograph, frame: Photograph) -> Photograph:
-    """The frame, its grey levels on the reference's scale; InputError for another size or depth."""
+    """The frame with the reference's full scale; InputError if size or bit depth differ."""
     files.require_same_shape(reference.image, frame.image, str(reference.path), str(frame.path))
     other = _other_depth(reference, frame)
     if other:
@@ -142,32 +142,32 @@ def require_alike(reference: Photograph, frame: Photograph) -> Photograph:
             f"and {_depth(frame)} in {frame.path}{other}; export them alike"
         )
     bits = max(reference.bits, frame.bits)
-    is_alike = frame.bits in (0, bits)  # else it is a darker frame of the series
+    is_alike = frame.bits in (0, bits)  # else the frame is darker and fills fewer bits
     return frame if is_alike else replace(frame, bits=bits, full_scale=float(2**bits - 1))
 
 
 def read_reference(path: Path | str, mask: BoolArray | None = None) -> Photograph:
-    """Read the reference and refuse it if it shows no pattern; see ``require_usable``."""
+    """Read the reference; InputError if it shows no pattern, see :func:`require_usable`."""
     reference = read_photograph(path)
     return replace(reference, notes=reference.notes + require_usable(reference, mask))
 
 
 def read_frame(path: Path | str, reference: Photograph) -> Photograph:
-    """Read one frame and compare it with the reference.
+    """Read one frame and check it against the reference.
 
-    InputError, in a line that names the file, if it is damaged, blank, or of another size or bit
-    depth: a sequence skips the frame, reports the line and goes on.
+    InputError, in one line that names the file, if it is damaged, blank, or differs in size or bit
+    depth; a sequence then skips the frame, reports the line and continues.
     """
     frame = require_alike(reference, read_photograph(path))
     return replace(frame, notes=frame.notes + require_usable(frame))
 
 
 def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> float:
-    """Correlation of pixels with their right and lower neighbours, uneven lighting removed [-]."""
+    """Correlation of pixels with their right and lower neighbours, without uneven lighting [-]."""
     weight = np.ones(image.shape, np.float32) if mask is None else mask.astype(np.float32)
     total = scipy.ndimage.uniform_filter(image * weight, _MEAN_PX)
     share = scipy.ndimage.uniform_filter(weight, _MEAN_PX)
-    reach = _MEAN_PX // 2  # beyond it the mean is not one-sided, so a ramp leaves nothing
+    reach = _MEAN_PX // 2  # so far from the border the mean is centred: it removes a ramp exactly
     is_large = min(image.shape) > 2 * _MEAN_PX
     interior = (slice(reach, -reach) if is_large else slice(None),) * 2
     fine = (weight * (image - total / np.maximum(share, 1e-6)))[interior].astype(np.float64)
@@ -179,7 +179,7 @@ def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> f
 
 
 def shows_blocks(image: FloatImage) -> bool:
-    """Whether an image (rows, cols) shows blocks, as JPEG of low quality and videos leave them."""
+    """Whether an image (rows, cols) has compression blocks, as low-quality JPEG and videos do."""
     for levels in (image[:, ::4], image[::4].T):
         bent = np.abs(np.diff(levels, 3, axis=0)).mean(axis=1)
         if bent.size < _BLOCK_PX**2:
@@ -191,12 +191,12 @@ def shows_blocks(image: FloatImage) -> bool:
 
 
 def _other_depth(reference: Photograph, frame: Photograph) -> str:
-    """Why the two have different depths; empty if they don't."""
+    """Text on why the bit depths differ; empty if they don't."""
     if frame.stored_bits != reference.stored_bits or (frame.bits == 0) != (reference.bits == 0):
         return " (as stored)"
     if frame.bits == reference.bits:
         return ""
-    # A dark frame fills fewer bits than its camera has: that alone says nothing.
+    # A dark frame fills fewer bits than its camera has, so fewer bits alone are no difference.
     bright = [float(np.percentile(p.image[::4, ::4], 99)) for p in (reference, frame)]
     ratio = max(bright) / max(min(bright), 1e-30)
     return f" (bright levels differ by a factor of {ratio:.3g})" if ratio >= _OTHER_SCALE else ""
@@ -211,7 +211,7 @@ def _depth(photograph: Photograph) -> str:
 
 
 def _scale(levels: NDArray[Any]) -> tuple[int, float]:
-    """Bits that the levels fill, and the level that counts as white."""
+    """Bits that the levels fill, and the white level."""
     top = float(levels.max())
     if levels.dtype.kind == "f":
         return 0, max(1.0, top)
@@ -220,7 +220,7 @@ def _scale(levels: NDArray[Any]) -> tuple[int, float]:
 
 
 def _cut_off(levels: NDArray[Any], full_scale: float) -> tuple[BoolArray, BoolArray]:
-    """(saturated, black) pixels: of a colour image those with any channel at its end."""
+    """(saturated, black) pixels; in colour: any channel saturated, or all channels black."""
     top = levels.max()
     ceiling = top if _piles_up(levels, float(top)) else full_scale
     high, low = np.asarray(levels >= ceiling), np.asarray(levels <= 0)
@@ -230,7 +230,7 @@ def _cut_off(levels: NDArray[Any], full_scale: float) -> tuple[BoolArray, BoolAr
 
 
 def _piles_up(levels: NDArray[Any], top: float) -> bool:
-    """Whether a camera cut off below full scale: far more pixels at the top than just under it."""
+    """Whether the camera clipped at level ``top``: more pixels have it than just lower levels."""
     if levels.dtype.kind == "f":
         return False
     step = int(np.gcd.reduce(np.unique(levels).astype(np.int64)))  # 16 for 12 bits shifted up

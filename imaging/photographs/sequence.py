@@ -1,7 +1,7 @@
-"""Sequences of photographs: folders in the order of their numbers, videos, and the frames' times.
+"""Sequences of photographs: numbered files in a folder, videos, and the times of the frames.
 
-Videos are read by imageio-ffmpeg, an optional library that brings its own ffmpeg; what is taken of
-them is written as TIFF, so that a frame is a file like any other.
+Videos are read by imageio-ffmpeg, an optional library that brings its own ffmpeg. The frames used
+are written as TIFF, so that each is a file like any other photograph.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ class SequenceFrame:
     """A photograph of a sequence, not read yet."""
 
     name: str
-    """Of its results; differs from all others' in the sequence."""
+    """Name of its results, unique in the sequence."""
     path: Path
-    """Of the photograph, or of the video that it is in."""
+    """File of the photograph, or of the video that contains it."""
     number: int | None = None
-    """In its name, the last one; in a video from 0."""
+    """The last number in the file's name; in a video the frame number, from 0."""
     time: float | None = None
-    """[s] since 1970 by the camera's clock, or since the sequence began; None where not known."""
+    """Time [s] since 1970 by the camera's clock, or since the sequence began; None if unknown."""
 
 
 def natural(path: Path | str) -> tuple[tuple[int, int | str], ...]:
-    """What names are sorted by, so that frame_2 comes before frame_10."""
+    """Sort key of file names that orders numbers by value: frame_2 comes before frame_10."""
     parts = re.split(r"(\d+)", Path(path).name.lower())
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in parts if part)
 
 
 def is_video(path: Path | str) -> bool:
-    """Whether a name, perhaps with the number of a frame as in test.mp4#12, is a video's."""
+    """Whether a path is a video's, with or without a frame number as in test.mp4#12."""
     return Path(str(path).partition("#")[0]).suffix.lower() in VIDEOS
 
 
 def pictures_in(folder: Path) -> tuple[Path, ...]:
-    """The photographs in a folder, in the order of their names' numbers.
+    """The photographs in a folder, in the order of the numbers in their names.
 
-    Hidden files are none. Raises InputError if there is no photograph.
+    Hidden files are ignored. Raises InputError if there is no photograph.
     """
     names = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=natural)
     found = tuple(p for p in names if p.suffix.lower() in PICTURES and p.is_file())
@@ -72,13 +72,13 @@ def pictures_in(folder: Path) -> tuple[Path, ...]:
 
 
 def numbered(paths: Iterable[Path]) -> tuple[SequenceFrame, ...]:
-    """Photographs as frames, with the last number of each name."""
+    """Photographs as frames, numbered by the last number in each name."""
     digits = ((path, re.findall(r"\d+", path.stem)) for path in paths)
     return tuple(SequenceFrame(p.stem, p, int(d[-1]) if d else None) for p, d in digits)
 
 
 def odd_numbers(frames: Sequence[SequenceFrame]) -> tuple[str, ...]:
-    """Which numbers are there twice, and which are missing, in words."""
+    """Texts about frame numbers that occur twice or are missing."""
     numbers = [frame.number for frame in frames if frame.number is not None]
     if len(numbers) < max(3, len(frames)):
         return ()
@@ -103,9 +103,9 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def times_of(paths: Sequence[Path]) -> tuple[list[float] | None, str]:
-    """When photographs were taken [s], and by what: names, Exif, or, as a last resort, the files.
+    """Times of the photographs [s] and their source: names, Exif, or else the files' dates.
 
-    The first of these that tells all photographs apart.
+    The first source that gives every photograph a different time is used; None if there is none.
     """
     known = (_named_time, "names"), (_exif_time, "Exif"), (_changed, "times of change")
     for read, source in known:
@@ -145,7 +145,7 @@ def _moment(text: str, form: str, fraction: str | None) -> float | None:
 
 
 def _changed(path: Path) -> float:
-    """When a file was changed last, as this machine's clock on the wall showed it."""
+    """Time of a file's last change [s] in local time, treated as UTC."""
     stamp = path.stat().st_mtime
     offset = datetime.fromtimestamp(stamp).astimezone().utcoffset()
     return stamp + (offset.total_seconds() if offset else 0.0)
@@ -160,13 +160,13 @@ class Video:
 
     path: Path
     count: int
-    """Of its frames, as far as its header knows."""
+    """Number of frames, as counted by ffmpeg without decoding them."""
     rate: float
-    """Frames a second."""
+    """Frames per second."""
 
     @classmethod
     def of(cls, path: Path) -> Video:
-        """Open a video; raises InputError if it is none, or ffmpeg finds no frames in it."""
+        """Open a video; raises InputError if it isn't one, or ffmpeg finds no frames in it."""
         require_file(path, "a video", _REMEDY)
         copied = subprocess.run(
             [_ffmpeg(), "-nostdin", "-i", str(path), "-map", "0:v:0", "-c", "copy", "-f", "null",
@@ -180,14 +180,14 @@ class Video:
         return cls(path, int(counts[-1]), float(rate[1]))
 
     def frame(self, number: int) -> SequenceFrame:
-        """One of its frames, by its number from 0."""
+        """The frame with a given number, from 0."""
         name = f"{self.path.stem}_{number:06d}"
         return SequenceFrame(name, self.path, number, number / self.rate)
 
     def levels(self, wanted: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Decode frames: their numbers from 0 and grey levels (rows, cols), one at a time.
+        """Decode the wanted frames: yield each number, from 0, and its grey levels (rows, cols).
 
-        What lies behind a damaged place, or the end, doesn't come.
+        Frames after a damaged one, or beyond the video's end, are not yielded.
         """
         left = set(wanted)
         command = [_ffmpeg(), "-nostdin", "-v", "quiet", "-i", str(self.path), "-map", "0:v:0",

@@ -1,1 +1,1 @@
-"""Speckle patterns that are known exactly everywhere, and their fast evaluation."""
+"""Speckle patterns known exactly at any point, and their fast evaluation."""

@@ -1,4 +1,4 @@
-"""A speckle pattern that is known exactly everywhere: one layer, or dots of ink on it.
+"""A speckle pattern known exactly at any point: one layer, or dots of ink on it.
 
 A layer is a stationary Gaussian random field (M. Grigoriu, Stochastic Calculus, Birkhäuser 2002,
 section 5.3.1.2) with a radially symmetric normal spectral density, thresholded and blurred by a
@@ -7,15 +7,15 @@ Gaussian. The samples blurred by the *continuous* Gaussian are a trigonometric p
     I(row, col) = sum_k  c_k exp(2 pi i (k_row row / rows + k_col col / cols)),
 
 because the Gaussian's transfer function at the samples' Nyquist frequency is 3e-9 or less: for
-blurs of less than 2 px the samples are finer than pixels. An inverse FFT gives it at whole pixels,
-a non-uniform FFT (Barnett, Magland & af Klinteberg, SIAM J. Sci. Comput. 41 (2019) C479,
+blurs of less than 2 px the samples are finer than pixels. An inverse FFT gives I at whole pixels, a
+non-uniform FFT (Barnett, Magland & af Klinteberg, SIAM J. Sci. Comput. 41 (2019) C479,
 doi:10.1137/18M120885X) at any other point, both to rounding. Where millions of points are needed, a
-B-spline of its waves is twenty times faster, and its error is proved to be small.
+B-spline of its waves is twenty times faster, with a proved error bound.
 
-A second layer is ink that an air brush leaves on a powdered surface, as on the specimen of the
-paper's section "Real Experiments": the ink's own field i, 0 ... 1, darkens what it lies on,
-I = p (1 - darkness i). Both are trigonometric polynomials, hence their product is; it is evaluated
-factor by factor.
+A second layer models ink that an air brush leaves on a powdered surface, as on the specimen of the
+paper's section "Real Experiments". The ink has an independent field i, 0 ... 1, and darkens the
+layer p below: I = p (1 - darkness i). Both factors, and hence their product, are trigonometric
+polynomials; the factors are evaluated separately.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from modeharvest.util.arrays import ComplexArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
 
 TOLERANCE = 2.0**-24
-"""Proved bound of the error between pixels [fraction of full scale]: float32's own rounding."""
+"""Proved error bound between pixels [fraction of full scale]: the rounding of float32."""
 NARROWEST = 2.0
-"""Least blur, in samples: the transfer function at Nyquist is exp(-pi^2 b^2 / 2) = 3e-9."""
+"""Least blur b [samples]: the transfer function at Nyquist is exp(-pi^2 b^2 / 2) = 3e-9."""
 
 
 def gaussian_field(
@@ -48,8 +48,8 @@ def gaussian_field(
 ) -> FloatArray:
     """One realisation of the Gaussian field, periodic with ``period`` (rows, cols) [samples].
 
-    White noise is filtered by the square root of the spectral density, of that standard deviation
-    [cycles/sample]. The sample's mean is 0; in expectation the variance is 1 and the median 0.
+    White noise is filtered by the square root of the spectral density, whose standard deviation is
+    given [cycles/sample]. The sample mean is 0; the expected variance is 1, the expected median 0.
     """
     noise = np.random.default_rng(seed).standard_normal(period)
     amplitude = np.exp(-_squared_frequency(period) / (4.0 * standard_deviation**2))
@@ -66,7 +66,7 @@ def gaussian_field(
 
 @dataclass(frozen=True)
 class BinaryField:
-    """A thresholded Gaussian field of two phases, and its blur: what a layer looks like."""
+    """Parameters of a layer: a thresholded Gaussian field with two phases, and its blur."""
 
     cycles_per_px: float
     """Standard deviation of the Gaussian field's spectral density [cycles/px]."""
@@ -75,22 +75,22 @@ class BinaryField:
     levels: tuple[float, float]
     """Values outside and inside the second phase, before the blur."""
     coverage: float
-    """Share of the area of the second phase [-]."""
+    """Area fraction of the second phase [-]."""
     seed: int | tuple[int, ...]
 
     @property
     def finer(self) -> int:
-        """Samples a pixel, along either axis, that hold the pattern."""
+        """Samples per pixel, along either axis, needed to represent the pattern."""
         return max(1, math.ceil(NARROWEST / self.blur_px))
 
 
 class Layer:
-    """One realisation of a blurred binary field: exact at whole pixels and anywhere between.
+    """One realisation of a blurred binary field, known exactly at and between pixels.
 
-    field : its phases and its blur.
-    shape : (rows, cols) of the image to cover [px]. The pattern is periodic with the next sizes
-        that suit an FFT; the realisation depends on them, hence on ``shape``.
-    period, samples : (rows, cols) of the period [px], of samples in it.
+    field : phases and blur.
+    shape : (rows, cols) of the image to cover [px]. The periods are the next larger sizes that
+        suit an FFT; the realisation depends on them, hence on ``shape``.
+    period, samples : (rows, cols) of the period [px]; number of samples in it.
     """
 
     def __init__(self, field: BinaryField, shape: tuple[int, int]) -> None:
@@ -103,17 +103,17 @@ class Layer:
         self._spectrum *= transfer / math.prod(self.samples)
 
     def binary(self) -> FloatArray:
-        """(rows, cols) of the samples: the two levels before the blur."""
+        """(rows, cols) samples of the two levels, before the blur."""
         field = self.field
         values = gaussian_field(field.cycles_per_px / field.finer, field.seed, self.samples)
         outside, inside = field.levels
         return np.where(values > -ndtri(field.coverage), inside, outside)
 
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
-        """(rows, cols) exact values at whole pixels, after a filter such as an aperture's.
+        """(rows, cols) exact values at whole pixels, optionally filtered, as by an aperture.
 
-        ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
-        multiplied by those of its row and its column frequency.
+        ``transfer`` maps frequencies along an axis [cycles/px] to factors; a plane wave is
+        multiplied by the factors of its row and its column frequency.
         """
         spectrum = self._spectrum * math.prod(self.samples)
         finer = self.field.finer
@@ -124,7 +124,7 @@ class Layer:
         return np.ascontiguousarray(whole[: self.shape[0], : self.shape[1]])
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """Values at image positions (row, col) [px], off by at most ``spline.bound``."""
+        """Values at image positions (row, col) [px], with an error of at most ``spline.bound``."""
         finer = self.field.finer
         if finer == 1:
             return self.spline(row, col)
@@ -132,7 +132,7 @@ class Layer:
 
     @cached_property
     def spline(self) -> PeriodicSpline:
-        """The pattern as a spline of positions in samples, made when first asked for."""
+        """The pattern as a spline of positions in samples, made at first use."""
         return PeriodicSpline.of(self._spectrum, self.samples, TOLERANCE)
 
     def exact(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
@@ -158,15 +158,15 @@ class Layer:
             row_angle, col_angle, modes, eps=eps, isign=1,
             nthreads=numba.get_num_threads(), showwarn=0,
         )  # fmt: skip
-        # The library's columns run from -n/2; ours from 0: a shift theorem makes up for it.
+        # The library's columns run from -n/2, ours from 0; the shift theorem corrects for it.
         shift = k_col.size // 2
         values = values.reshape(len(modes), -1) * np.exp(1j * shift * col_angle)
         return np.ascontiguousarray(values.real).reshape(len(modes), *row.shape)
 
     def _modes(self, eps: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Pick the non-negligible modes of a real image, wave numbers k_row centred, k_col >= 0.
+        """Select the non-negligible Fourier modes of a real image: k_row centred, k_col >= 0.
 
-        What is left out sums to at most ``eps`` of the image's mean in absolute value.
+        The sum of the omitted absolute values is at most ``eps`` of the image's mean.
         """
         rows = self.samples[0]
         size = np.abs(self._spectrum)
@@ -188,33 +188,33 @@ def _squared_frequency(period: tuple[int, int]) -> FloatArray:
 
 
 def _cut(size: FloatArray, allowed: float) -> int:
-    """Find the last index to keep so that what follows sums to at most ``allowed``."""
+    """Find the last index to keep so that the later values sum to at most ``allowed``."""
     tail = np.cumsum(size[::-1])[::-1]
     return max(1, int(np.count_nonzero(tail > allowed)) - 1)
 
 
 SpectralUnit = Literal["cycles/px", "rad/px"]
 _CYCLES: dict[str, float] = {"cycles/px": 1.0, "rad/px": 1.0 / (2.0 * math.pi)}
-_NARROWEST_BLUR_PX = 0.75  # 3 x 3 samples a pixel
-_WIDEST_BLUR_PX = 100.0  # beyond it no speckle is left
-_LOWEST_FREQUENCY = 1e-4  # cycles/px: speckles of thousands of pixels
-_WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations away
+_NARROWEST_BLUR_PX = 0.75  # needs 3 x 3 samples per pixel
+_WIDEST_BLUR_PX = 100.0  # a wider blur would remove all speckle
+_LOWEST_FREQUENCY = 1e-4  # cycles/px: speckle of thousands of pixels
+_WIDEST_FREQUENCY = 0.125  # cycles/sample: Nyquist is 4 standard deviations away
 
 
 @dataclass(frozen=True)
 class Ink:
-    """Dots of ink on the first layer, from a field of their own; InputError if out of range."""
+    """Dots of ink on the first layer, an independent field; InputError if out of range."""
 
     standard_deviation: float = 0.05
     """Standard deviation of the Gaussian field's spectral density [cycles/px]."""
     blur_px: float = 1.5
     """Standard deviation of the Gaussian blur [px]."""
     coverage: float = 0.4
-    """Share of the area under ink [-]."""
+    """Fraction of the area covered with ink [-]."""
     darkness: float = 0.8
-    """Share of the light that ink takes away [-]."""
+    """Fraction of the light absorbed by ink [-]."""
     seed: int = 0
-    """Of the random numbers; streams differ from those of the layer below."""
+    """Seed of the random numbers, independent of those of the layer below."""
 
     def __post_init__(self) -> None:
         _require_band_limited(self.standard_deviation, self.blur_px, "ink")
@@ -225,29 +225,29 @@ class Ink:
 
     @property
     def binary_field(self) -> BinaryField:
-        """What the layer is made of."""
+        """Parameters of the ink layer."""
         spread, seed = self.standard_deviation, (self.seed, 1)
         return BinaryField(spread, self.blur_px, (0.0, 1.0), self.coverage, seed)
 
 
 @dataclass(frozen=True)
 class SpeckleSpec:
-    """What the speckle looks like; InputError if a value is out of its range."""
+    """Parameters of the speckle pattern; InputError if a value is out of range."""
 
     standard_deviation: float = 1.0 / 20.0
-    """Of the spectral density of the Gaussian field, in ``unit``."""
+    """Standard deviation of the spectral density of the Gaussian field, in ``unit``."""
     unit: SpectralUnit = "cycles/px"
     """Either "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px" (2 pi
-    times coarser); the paper leaves it open."""
+    times coarser); the paper doesn't specify it."""
     blur_px: float = 3.0
     """Standard deviation of the Gaussian blur [px], at least 0.75."""
     dark: float = 0.2
     bright: float = 1.0
     """Grey levels of the two phases before the blur, as fractions of full scale [-]."""
     seed: int = 0
-    """Of the random numbers."""
+    """Seed of the random numbers."""
     ink: Ink | None = None
-    """A second layer; none by default."""
+    """A second layer, of ink; none by default."""
 
     def __post_init__(self) -> None:
         if self.unit not in _CYCLES:
@@ -265,7 +265,7 @@ class SpeckleSpec:
 
     @property
     def binary_field(self) -> BinaryField:
-        """What the pattern, or the layer under the ink, is made of: half dark, half bright."""
+        """Parameters of the pattern, or of the layer under the ink: half dark, half bright."""
         levels = self.dark, self.bright
         return BinaryField(self.cycles_per_px, self.blur_px, levels, 0.5, self.seed)
 
@@ -278,10 +278,10 @@ def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> No
 
 
 class Speckle:
-    """One speckle pattern: exact intensities at whole pixels and anywhere between.
+    """One speckle pattern, with exact intensities at and between pixels.
 
-    ``shape`` (rows, cols) is that of the image to cover [px], see :class:`Layer`, ``period`` (rows,
-    cols) that after which it repeats itself [px].
+    ``shape``: (rows, cols) of the image to cover [px], see :class:`Layer`. ``period``: (rows, cols)
+    after which the pattern repeats [px].
     """
 
     def __init__(self, spec: SpeckleSpec, shape: tuple[int, int]) -> None:
@@ -296,32 +296,32 @@ class Speckle:
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
         """(rows, cols) exact intensities at whole pixels [fraction of full scale].
 
-        For ``transfer`` see :meth:`Layer.image`; InputError with ink, whose waves are products.
+        ``transfer``: see :meth:`Layer.image`; InputError with ink, as the pattern is a product.
         """
         if transfer is not None and self._ink is not None:
             raise InputError("speckle: expected one layer where pixels average, got two")
         return self._product(lambda layer: layer.image(transfer))
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """Intensities at image positions (row, col) [px], of their shape; NaN where they are.
+        """Intensities at image positions (row, col) [px], of their shape; NaN at NaN positions.
 
-        Off by at most ``bound``, 6e-8 of full scale a layer; in fact by less than 1 % of that.
+        The error is at most ``bound``, 6e-8 of full scale per layer; typically below 1 % of it.
         """
         return self._product(lambda layer: layer(row, col))
 
     def _product(self, value: Callable[[Layer], FloatArray]) -> FloatArray:
-        """What the base layer has of a value, darkened by what the ink has of it."""
+        """``value`` of the base layer, darkened by ``value`` of the ink."""
         base = value(self._base)
         return base if self._ink is None else base * (1.0 - self._darkness * value(self._ink))
 
     @property
     def spline(self) -> PeriodicSpline:
-        """The base layer as a spline of positions in samples, made when first asked for."""
+        """The base layer as a spline of positions in samples, made at first use."""
         return self._base.spline
 
     @property
     def bound(self) -> float:
-        """Proved bound of a call's error [fraction of full scale]."""
+        """Proved error bound of calls [fraction of full scale]."""
         ink = 0.0 if self._ink is None else self._darkness * self._ink.spline.bound
         return self.spline.bound + ink + ink * self.spline.bound
 

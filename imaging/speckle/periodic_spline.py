@@ -1,17 +1,17 @@
-"""A periodic, band-limited pattern between its samples: a B-spline of degree 7, with a proof.
+"""Interpolation of a periodic, band-limited pattern by a B-spline of degree 7, with error bound.
 
 Let B be the centred B-spline of degree 7 (8 = DEGREE + 1 taps), and
 
     p(x) = sum_k c_k exp(2 pi i f_k x),      f_k in cycles per sample.
 
-By Poisson's summation formula the spline with the coefficients' spectrum c_k / B^(f_k), where
+By Poisson's summation formula, the spline whose coefficients have the spectrum c_k / B^(f_k), with
 B^(f) = (sin(pi f) / (pi f))^8, is
 
     s(x) = sum_k c_k exp(2 pi i f_k x) (1 + sum_{m != 0} (f_k / (f_k + m))^8 exp(2 pi i m x)),
 
-since sin^8 has the period 1. So a wave is off by at most e(f) = sum_{m != 0} (f / (f + m))^8
-of its amplitude, in the plane by e(f) + e(g) + e(f) e(g), and the pattern by at most the sum of
-that over its waves. Finer samples make every f smaller; as many are taken as keep the bound.
+since sin^8 has the period 1. So the error of a wave is at most e(f) = sum_{m != 0} (f / (f + m))^8
+of its amplitude; in the plane, e(f) + e(g) + e(f) e(g). The pattern's error is at most the sum of
+this over its waves. Finer samples make every f smaller; as many are used as the bound requires.
 
 Source: M. Unser, IEEE Signal Process. Mag. 16(6) (1999) 22, doi:10.1109/79.799930.
 """
@@ -34,24 +34,24 @@ DEGREE = 7
 _TAPS = DEGREE + 1
 _FINER = (1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 4.0)
 BLOCK = 256
-"""Points that one thread takes at a time; their weights fit into the fastest cache."""
+"""Number of points a thread processes at a time; their weights fit into the fastest cache."""
 _NOWHERE = -(2**62)
 
 
 class SplineTable(NamedTuple):
-    """A spline in a compiled kernel."""
+    """A spline's data for compiled kernels."""
 
     coefficients: FloatArray
-    """(rows + 7, cols + 7) as those of :class:`PeriodicSpline`."""
+    """(rows + 7, cols + 7), those of :class:`PeriodicSpline`."""
     weights: FloatArray
-    """(8, 8) coefficient of t^d in the weight of tap j."""
+    """(8, 8) coefficients of t^d in the weight of tap j."""
     finer_row: float
     finer_col: float
-    """Samples a pixel."""
+    """Samples per pixel."""
 
 
 class Workspace(NamedTuple):
-    """Arrays for a kernel's work on ``BLOCK`` points: their samples, tap weights and fractions."""
+    """A kernel's work arrays for ``BLOCK`` points: sample indices, tap weights, fractions."""
 
     i: IntArray
     j: IntArray
@@ -62,23 +62,23 @@ class Workspace(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PeriodicSpline:
-    """A pattern that can be evaluated anywhere, fast, to within a proved bound."""
+    """A pattern that can be evaluated fast at any point, with a proved error bound."""
 
     coefficients: FloatArray
-    """(rows + 7, cols + 7) B-spline coefficients over one period of the finer samples; the first
-    ones are repeated after the last."""
+    """(rows + 7, cols + 7) B-spline coefficients over one period of the finer samples, continued
+    periodically on both sides."""
     period: tuple[int, int]
     """(rows, cols) of the period [px]."""
     bound: float
-    """Of the error anywhere, in units of the pattern."""
+    """Bound of the error at any point, in units of the pattern."""
 
     @classmethod
     def of(
         cls, spectrum: ComplexArray, period: tuple[int, int], tolerance: float
     ) -> PeriodicSpline:
-        """Make the spline of a real pattern by its waves c_k (rows, cols // 2 + 1), as of an FFT.
+        """Make the spline of a real pattern with waves c_k (rows, cols // 2 + 1), as in a real FFT.
 
-        ``period`` is (rows, cols) [px]; the bound is below ``tolerance`` if 4 x 4 samples do.
+        ``period``: (rows, cols) [px]. ``bound`` <= ``tolerance`` if 4 x 4 samples per px suffice.
         """
         size = np.abs(spectrum)
         for finer in _FINER:
@@ -94,7 +94,7 @@ class PeriodicSpline:
         return cls(np.pad(samples, (before, after), mode="wrap"), period, bound)
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """Values at positions (row, col) [px], of the positions' shape; NaN where they are."""
+        """Values at positions (row, col) [px], of their shape; NaN at NaN positions."""
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         out = np.empty(row.size)
         in_parallel(_sample, self.table, row.ravel(), col.ravel(), out)
@@ -102,15 +102,15 @@ class PeriodicSpline:
 
     @property
     def table(self) -> SplineTable:
-        """The spline as kernels take it."""
+        """The spline's data for compiled kernels."""
         finer = np.subtract(self.coefficients.shape, DEGREE) / self.period
         return SplineTable(self.coefficients, _weights(), float(finer[0]), float(finer[1]))
 
 
 def _wave_errors(period: int, fine: int) -> FloatArray:
-    """(period,) e(f) of the waves along one axis, in the layout of an FFT.
+    """(period,) errors e(f) of the waves along one axis, in the layout of an FFT.
 
-    The wave at the Nyquist frequency of whole pixels, which has no sign, is left out: 1.
+    The wave at the Nyquist frequency of whole pixels, which has no sign, is omitted: error 1.
     """
     k = np.rint(np.fft.fftfreq(period, 1.0 / period))
     f = np.abs(k) / fine
@@ -121,7 +121,7 @@ def _wave_errors(period: int, fine: int) -> FloatArray:
 
 
 def _bound(size: FloatArray, row: FloatArray, col: FloatArray) -> float:
-    """Sum of |c_k| e_k; all columns but the first stand for two waves."""
+    """Sum of |c_k| e_k; every column except the first represents two waves."""
     multiplicity = np.full(size.shape[1], 2.0)
     multiplicity[0] = 1.0
     weighted = size @ np.column_stack([multiplicity, multiplicity * col])
@@ -131,7 +131,7 @@ def _bound(size: FloatArray, row: FloatArray, col: FloatArray) -> float:
 def _prefiltered(
     spectrum: ComplexArray, period: tuple[int, int], fine: tuple[int, int]
 ) -> ComplexArray:
-    """Divide the waves by B^ and lay them into the spectrum of the finer samples."""
+    """Divide the waves by B^ and put them into the spectrum of the finer samples."""
     most_rows, most_cols = ((n - 1) // 2 for n in period)
     k_row, k_col = np.arange(-most_rows, most_rows + 1), np.arange(most_cols + 1)
     waves = spectrum[k_row, : most_cols + 1]
@@ -172,7 +172,7 @@ def workspace() -> Workspace:
 def sample(
     table: SplineTable, row: FloatArray, col: FloatArray, out: FloatArray, work: Workspace
 ) -> None:
-    """Evaluate up to ``BLOCK`` points: places and weights in vector instructions, then sums."""
+    """Evaluate up to ``BLOCK`` points: indices and weights in vector instructions, then sums."""
     c, w, v = table.coefficients, work.w, work.v
     rows, cols = c.shape[0] - DEGREE, c.shape[1] - DEGREE
     _place(row, table.finer_row, work.i, work.beyond)
@@ -193,7 +193,7 @@ def sample(
 
 @compiled(inner=True, relaxed=True)
 def _place(position: FloatArray, finer: float, sample: IntArray, beyond: FloatArray) -> None:
-    """Split positions [px] into the sample before them and how far they lie beyond it."""
+    """Split positions [px] into the index of the sample before and the fraction beyond it."""
     for k in range(position.size):
         at = position[k] * finer
         whole = np.floor(at)
@@ -213,7 +213,7 @@ def _tap_weights(a: FloatArray, t: FloatArray, w: FloatArray) -> None:
 
 @compiled(inline=True, relaxed=True)
 def _patch(c: FloatArray, i: int, j: int, w: FloatArray, v: FloatArray, k: int) -> float:
-    """Sum 8 x 8 coefficients from (i, j) on, times the weights of point k."""
+    """Sum of the 8 x 8 coefficients from (i, j) on, times the weights of point k."""
     w0, w1, w2, w3 = w[0, k], w[1, k], w[2, k], w[3, k]
     w4, w5, w6, w7 = w[4, k], w[5, k], w[6, k], w[7, k]
     total = 0.0

@@ -1,12 +1,12 @@
-"""Mean, variance and mean square gradient of a speckle, as its spectrum has them: no image made.
+"""Mean, variance and mean square gradient of a speckle from its spectrum, without an image.
 
-A layer is one where a Gaussian field of autocorrelation rho exceeds t, and zero elsewhere. Its
+A layer is 1 where a Gaussian field with autocorrelation rho exceeds t, and 0 elsewhere. Its
 autocovariance is Mehler's series
 
     C = phi(t)² Σ He_{n-1}(t)² / n! rho^n,   n = 1, 2, ...
 
 (A. Papoulis, S. U. Pillai, Probability, Random Variables and Stochastic Processes, 4th ed. 2002,
-chapter 9). Here rho = exp(-r² / (2 a²)), so every term is a Gaussian, and stays one behind a blur.
+chapter 9). Here rho = exp(-r² / (2 a²)), so every term is a Gaussian, also after a Gaussian blur.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from scipy.special import ndtri
 from modeharvest.imaging.speckle.pattern import BinaryField, SpeckleSpec
 
 _TERMS = 400
-"""What follows is 1e-4 of the mean square gradient."""
+"""Terms of the series; the neglected ones are 1e-4 of the mean square gradient."""
 
 
 @dataclass(frozen=True)
 class SpeckleStatistics:
-    """Of the grey levels, over all realisations [fraction of full scale]."""
+    """Expected statistics of the grey levels [fraction of full scale; variance: squared]."""
 
     mean: float
     variance: float
@@ -34,9 +34,9 @@ class SpeckleStatistics:
 
     @classmethod
     def of(cls, spec: SpeckleSpec, spread: float = 0.0) -> SpeckleStatistics:
-        """Of a speckle behind another blur, of variance ``spread`` [px²].
+        """Statistics of a speckle after a further Gaussian blur of variance ``spread`` [px²].
 
-        Ink is independent of what it lies on.
+        Ink is independent of the layer below.
         """
         base = cls._of_layer(spec.binary_field, spread)
         if spec.ink is None:

@@ -1,1 +1,1 @@
-"""Scoring: fields of any DIC code against the truth of an image set, and on the star pattern."""
+"""Scoring of fields of any DIC code: against an image set's truth, and on the star pattern."""

@@ -1,4 +1,4 @@
-"""Benchmark image sets: public images, the truth apart from them, and fields measured on them.
+"""Benchmark image sets: public images, separate truth, and fields measured on the images.
 
 ::
 
@@ -6,8 +6,8 @@
            benchmark.json README.md
     TRUTH/ solution.h5 benchmark.json
 
-Nothing in the public folder reveals the displacements: neither the solution nor the material,
-loading or imperfection that it could be computed from. The set's id is a digest of its files.
+Nothing in the public folder reveals the displacements: it has neither the solution nor the
+material, loading or imperfection to compute it from. The set's id is a digest of its files.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ RETURNED = {
     "id": "a first line '# benchmark: ID' lets a mistaken file be noticed",
     "formats": ["csv", "npz", "h5", "mat", "vtu"],
 }
-"""How displacements are to be returned."""
+"""Specification of the displacements to be returned."""
 
 _README = resources.files(__package__).joinpath("readme.txt").read_text("utf-8")
 
@@ -69,7 +69,7 @@ def readme(info: Mapping[str, Any]) -> str:
 FORMAT, TRUTH_FORMAT = "modeharvest-benchmark-1", "modeharvest-benchmark-truth-1"
 SIDECAR, README, SOLUTION = "benchmark.json", "README.md", "solution.h5"
 SECRETS = ("solution*", "truth*", "images*", "stages.json", "*.h5", "*.vtu", "*.toml")
-"""What gives the truth away, or what the truth can be computed from."""
+"""Files that contain the truth, or from which it can be computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +81,11 @@ class BenchmarkTruth:
     grid: PixelGrid
     specimen: Specimen
     strains: tuple[float, ...]
-    """Nominal, of the deformed images [-]."""
+    """Nominal strains of the deformed images [-]."""
 
     @classmethod
     def read(cls, folder: Path | str) -> BenchmarkTruth:
-        """Open a truth folder; InputError if it is none, or its solution not that of the images."""
+        """Open a truth folder; InputError if it isn't one, or its solution isn't the images'."""
         folder, what = Path(folder), "the truth of a benchmark"
         remedy = (
             "'modeharvest benchmark make' leaves it beside the public folder, which has a "
@@ -114,10 +114,10 @@ class BenchmarkTruth:
         return locate(mesh.nodes, mesh.cells, mesh.element, self.grid).mask
 
     def displacement(self, strain: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """(n, 2) displacement at points of the reference, by the element that each lies in [mm].
+        """(n, 2) displacement at points of the reference, interpolated in their elements [mm].
 
-        NaN beside the material, and where a position is. ``strain``: of the deformed image [-], an
-        InputError if there is none; ``x, y``: (n,) [mm].
+        NaN outside the material and at NaN positions. ``strain``: nominal strain of a deformed
+        image [-], InputError if there is none; ``x, y``: (n,) [mm].
         """
         if not any(abs(strain - known) < 1e-9 for known in self.strains):
             have = ", ".join(f"{known:g}" for known in self.strains)
@@ -129,7 +129,7 @@ class BenchmarkTruth:
 
 
 def set_record(form: str, files: Mapping[str, Any], **content: Any) -> dict[str, Any]:
-    """What a public set says of itself; its id is a digest of its files' sizes and digests."""
+    """Description of a public set; its id is a digest of its files' sizes and digests."""
     return {
         "format": form,
         "id": digest(files)[:12],
@@ -144,12 +144,12 @@ def set_record(form: str, files: Mapping[str, Any], **content: Any) -> dict[str,
 def publish(
     images: ImageSet, specimen: Specimen, public: Path | str, truth: Path | str
 ) -> dict[str, Any]:
-    """Write the public folder, and into the truth's folder what belongs to it.
+    """Write the public folder, and the record that belongs to it into the truth folder.
 
     ``images``: a finished set; ``specimen``: the undeformed geometry; ``public``: a finished set of
-    the same images is left as it is; ``truth``: holds ``solution.h5``, of which they were made.
+    the same images there is kept; ``truth``: contains ``solution.h5``, the images' solution.
     Returns the content of the public ``benchmark.json``. InputError if a lens distorts the images,
-    they are not what was rendered, or the truth would be public.
+    image files were changed after rendering, or the truth would be public.
     """
     public, truth = Path(public), Path(truth)
     require_apart(public, truth)
@@ -169,7 +169,7 @@ def publish(
             "solution_sha256": disk.sha256_of(truth / SOLUTION),
             "public_sha256": {name: disk.sha256_of(public / name) for name in (SIDECAR, README)},
         }
-        disk.write_json(truth / SIDECAR, hidden)  # last: it says that all is there
+        disk.write_json(truth / SIDECAR, hidden)  # last: it marks the set as complete
     content: dict[str, Any] = disk.read_json(public / SIDECAR)
     return content
 
@@ -190,7 +190,7 @@ def require_apart(public: Path, truth: Path) -> None:
 
 
 def require_no_lens(spec: ImagingSpec) -> None:
-    """Raise InputError if images are distorted: what they show is not the specimen's motion."""
+    """Raise InputError if images are distorted: their apparent motion isn't the specimen's."""
     if spec.distortion is not None:
         raise InputError(
             "expected images without a lens for a benchmark, got distorted ones, in which a "
@@ -229,7 +229,7 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
 
 
 def _is_whole(public: Path, truth: Path, images: ImageSet) -> bool:
-    """Whether both folders hold these images and their truth, nothing missing or changed."""
+    """Whether both folders hold these images and their truth, complete and unchanged."""
     try:
         info, hidden = disk.read_json(public / SIDECAR), disk.read_json(truth / SIDECAR)
         digests = {name: entry["sha256"] for name, entry in info["files"].items()}
@@ -255,13 +255,13 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class Declared:
-    """What is declared of a field's file that it doesn't state itself.
+    """Properties of a field's file that it doesn't state itself.
 
-    What has no words is as for :func:`modeharvest.idic.local.field.read_field`.
+    Fields without a description: see :func:`modeharvest.idic.local.field.read_field`.
     """
 
     name: str | None = None
-    """Of the code, for tables; the file's by default."""
+    """Name of the code, for tables; by default the file's name."""
     units: str | None = None
     displacement_units: str | None = None
     y_axis: str | None = None
@@ -274,9 +274,9 @@ def read_measured(
 ) -> LocalField:
     """Read a field to be graded.
 
-    ``path``: of any kind that :func:`~modeharvest.idic.local.field.read_field` reads; ``grid``,
-    ``benchmark``: the benchmark's pixels, and its id. InputError if it can't be read, or says that
-    it is of another benchmark.
+    ``path``: a file that :func:`~modeharvest.idic.local.field.read_field` can read; ``grid``,
+    ``benchmark``: the benchmark's pixels and its id. InputError if the file can't be read, or names
+    another benchmark.
     """
     path, how = Path(path), asdict(declared or Declared())
     name = how.pop("name") or path.stem

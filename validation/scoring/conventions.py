@@ -1,10 +1,10 @@
 """Convention checks: axes, signs, units and origin of a displacement field against the truth.
 
-What a DIC code writes can be misread in many ways, several at once: y up for y down, u and v
-or rows and columns exchanged, a sign, deformed positions for reference ones, another origin, px for
-mm. All combinations are tried against the truth. One is reported only if the errors with it are
-smaller than as declared by more than chance explains, and if it leaves nothing of what it was to
-explain: an error of another kind (noise, bias, too small a strain) is not taken for a convention.
+A DIC code's output can be misread in many ways, several at once: y up for y down, u and v or rows
+and columns exchanged, a wrong sign, deformed for reference positions, another origin, px for mm.
+All combinations are compared with the truth. A combination is reported only if it makes the errors
+significantly smaller than the declared convention does, and if it removes the whole effect that it
+should explain. Other errors (noise, bias, too small a strain) are thus not taken for a convention.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 Truth = Callable[[FloatArray, FloatArray], FloatArray]
-"""(n, 2) true displacement [mm] at positions x, y (n,) [mm]; NaN off the material."""
+"""(n, 2) true displacement [mm] at positions x, y (n,) [mm]; NaN outside the material."""
 
 _POINTS = 4000
-"""So many are looked at, a quarter of them where nothing is decided yet."""
+"""Number of points compared, a quarter of them in the first selection."""
 _BLOCKS = 5
-"""Along each axis: errors of points near to each other are alike, those of blocks are not."""
+"""Blocks along each axis: errors are correlated within, but assumed independent between blocks."""
 _FEWEST_BLOCKS = 8
 _CHANCE = 1e-7
-"""Of rejecting a right field, for each of a few hundred readings [-]."""
+"""Probability of rejecting a correct field, for each of some 1500 readings [-]."""
 _SMALL_PX = 1e-3
-"""A mean error that is smaller by less is of no interest [px]."""
+"""A smaller reduction of the mean error is ignored [px]."""
 _INEXACT = 0.1
-"""By how much, beyond chance, errors may differ from what a reading explains [-]: a tenth, because
-displacements that are a tenth too small may be misunderstood, too."""
+"""Deviation, beyond chance, allowed between errors and the effect of a reading [-]: a tenth, since
+also displacements that are 10 % too small may be declared wrongly."""
 _KEPT = 6
-"""Readings that are looked at more closely."""
+"""Number of readings examined more closely."""
 
 _KEEP = np.eye(2)
 _TURN = np.diag([1.0, -1.0])
@@ -56,51 +56,51 @@ _COMPONENTS = (
     (_TURN @ _EXCHANGE_UP, 2, "u and v were v and -u (y up)"),
     (-_TURN @ _EXCHANGE_UP, 2, "u and v were -v and u (y up)"),
 )
-"""What u and v may have been, in the physical frame: matrix, number of changes, text."""
+"""Possible meanings of u and v in the physical frame: matrix, number of changes, text."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One way to take a field's numbers, relative to how they were declared."""
+    """An interpretation of a field's numbers, relative to the declared one."""
 
     turn: FloatArray
     shift: FloatArray
     """(2, 2) [-] and (2,) [mm]: positions are ``turn @ (x, y) + shift``."""
     origin: FloatArray
-    """(2,) moves them further [mm]."""
+    """(2,) further shift of the positions, of the origin [mm]."""
     components: FloatArray
     """(2, 2): displacements are ``scale * components @ (u, v)``."""
     scale: float = 1.0
-    """Because of a wrong unit [-]."""
+    """Factor due to a wrong unit [-]."""
     deformed: bool = False
-    """Whether the positions are those of the deformed image."""
+    """Whether the positions are those in the deformed image."""
     changes: int = 0
-    """How many things were declared wrongly."""
+    """Number of wrong declarations."""
     text: tuple[str, ...] = ()
-    """What they are; empty for the field as declared."""
+    """Text on each of them; empty for the field as declared."""
 
     def with_change(self, count: int, text: str, **values: Any) -> Reading:
-        """The same with another change, or several that go together."""
+        """The same reading with another change, or several connected ones."""
         changed = replace(self, **values)
         known = (*self.text, text) if text else self.text
         return replace(changed, changes=self.changes + count, text=known)
 
     @property
     def orientation(self) -> tuple[float, ...]:
-        """All numbers but the origin's."""
+        """All its numbers except the origin."""
         how = (*self.components.ravel(), self.scale, self.deformed)
         return (*self.turn.ravel(), *self.shift, *how)
 
     @property
     def place(self) -> tuple[float, ...]:
-        """What its positions depend on."""
+        """All numbers that its positions depend on."""
         moved = (*self.turn.ravel(), *(self.shift + self.origin))
         return (*moved, *self.components.ravel(), self.scale) if self.deformed else moved
 
     def applied(
         self, x: FloatArray, y: FloatArray, u: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Positions (n,), (n,) and displacements (n, 2) as they are with this reading [mm]."""
+        """Positions x, y (n,) and displacements (n, 2) according to this reading [mm]."""
         u = self.scale * u @ self.components.T
         x, y = self.turn @ np.stack([x, y]) + (self.shift + self.origin)[:, None]
         return (x - u[:, 0], y - u[:, 1], u) if self.deformed else (x, y, u)
@@ -113,11 +113,11 @@ DECLARED = Reading(_KEEP, np.zeros(2), np.zeros(2), _KEEP)
 def check_conventions(
     field: LocalField, truth: Truth, grid: PixelGrid
 ) -> tuple[Reading, tuple[str, ...]]:
-    """What a field means: as declared, or with the fewest changes that explain its errors.
+    """Find the reading of a field: as declared, or the fewest changes that explain its errors.
 
-    ``field`` as declared, ``grid``: the reference image's pixels. Returns the reading, and a
-    sentence about it; none if it is the declared one, or points are too few. InputError if the
-    displacements are in pixels and were declared as millimetres, or the reverse.
+    ``field``: as declared; ``grid``: the reference image's pixels. Returns the reading and a text
+    about it (no text for the declared reading, or with too few points). InputError if the
+    displacements are in pixels but declared as millimetres, or the reverse.
     """
     every = field.valid_points()
     some = np.linspace(0, len(every[0]) - 1, min(len(every[0]), _POINTS)).astype(int)
@@ -143,7 +143,7 @@ def check_conventions(
 
 
 def _orientations(grid: PixelGrid) -> list[Reading]:
-    """All ways to turn positions and displacements: those with fewer changes first."""
+    """All transformations of axes of positions and displacements, those with few changes first."""
     found: dict[tuple[float, ...], Reading] = {}
     turned = [DECLARED, *_turned_positions(grid)]
     for reading, (matrix, changes, text) in itertools.product(turned, _COMPONENTS):
@@ -155,13 +155,13 @@ def _orientations(grid: PixelGrid) -> list[Reading]:
 
 
 def _turned_positions(grid: PixelGrid) -> Iterator[Reading]:
-    """The y axis the other way, rows and columns exchanged; counted in px or mm, y up or down."""
+    """Readings with y reversed, or rows and columns exchanged; in px or mm, y up or down."""
     zero, first = np.zeros(2), np.array([grid.x0, grid.y0])
     low = first - [0.0, (grid.rows - 1) * grid.pixel_size]
     middle = 0.5 * (first + low)
     flipped, exchanged = "the y axis pointed the other way", "rows and columns were exchanged"
     both, pairs = f"{exchanged} and {flipped}", ((first, low), (low, first), (zero, zero))
-    for matrix, changes, centres, text in (  # a centre is where what was counted from it lies
+    for matrix, changes, centres, text in (  # centres: (before, after), for each assumed origin
         (_TURN, 1, ((middle, middle), (zero, zero)), flipped),
         (_EXCHANGE_DOWN, 1, ((first, first), (zero, zero)), exchanged),
         (_EXCHANGE_UP, 1, ((low, low), (zero, zero)), "x and y (up) were exchanged"),
@@ -175,7 +175,7 @@ def _turned_positions(grid: PixelGrid) -> Iterator[Reading]:
 
 
 def _far_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
-    """Where else positions may have been counted from: (2,) [mm], and its text."""
+    """Other possible origins of positions: shift (2,) [mm], and text."""
     first, last = (np.array(grid.to_mm(*at)) for at in ((0, 0), (grid.rows - 1, grid.cols - 1)))
     yield first, "positions were counted from the upper left pixel"
     yield np.array([first[0], last[1]]), "positions were counted from the lower left pixel"
@@ -185,7 +185,7 @@ def _far_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
 
 
 def _near_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
-    """What else the first pixel's centre may have been called: (2,) [mm], and its text."""
+    """Other possible coordinates of the first pixel's centre: shift (2,) [mm], and text."""
     for number, y_down in itertools.product((0.5, 1.0, -0.5, -1.0), (1.0, -1.0)):
         shift = -number * grid.pixel_size * np.array([1.0, -y_down])
         called = f"({number:g}, {number:g})" + (" (y up)" if y_down < 0 else "")
@@ -193,10 +193,10 @@ def _near_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
 
 
 def _promising(sample: _FieldSample, grid: PixelGrid) -> list[Reading]:
-    """The readings with the smallest errors, and those that differ from them by little.
+    """The readings with the smallest errors, and readings that differ little from them.
 
-    First all that change displacements by as much as they are, at a few points; to the best of
-    them is added what changes less: deformed positions, then the first pixel.
+    First, readings with large effects are compared at a few points. To the best of them, changes
+    with smaller effects are added: deformed positions, then the first pixel.
     """
     few, turned = sample.every(4), _orientations(grid)
     turned += [
@@ -219,7 +219,7 @@ def _promising(sample: _FieldSample, grid: PixelGrid) -> list[Reading]:
 
 
 def _in_deformed_positions(reading: Reading) -> Reading:
-    """The same at positions in the deformed image; there, the other sign leads back."""
+    """The reading with deformed positions; with the sign reversed, it describes the way back."""
     back = "u led from the deformed image back to the reference"
     if _OTHER_SIGN in reading.text:
         rest = tuple(text for text in reading.text if text != _OTHER_SIGN)
@@ -228,9 +228,9 @@ def _in_deformed_positions(reading: Reading) -> Reading:
 
 
 class _FieldSample:
-    """Some of a field's points, with the errors of readings of them.
+    """A sample of a field's points, to compute the errors of readings.
 
-    ``points``: x, y (n,) and u (n, 2) as declared [mm]; ``unit``: a pixel [mm].
+    ``points``: x, y (n,) and u (n, 2) as declared [mm]; ``unit``: size of a pixel [mm].
     """
 
     def __init__(self, points: Sequence[FloatArray], truth: Truth, unit: float) -> None:
@@ -242,13 +242,13 @@ class _FieldSample:
         self.cap = 3.0 * float(np.nanmedian(length)) if np.isfinite(length).any() else np.inf
 
     def every(self, step: int) -> _FieldSample:
-        """One of so many points."""
+        """A sample of every ``step``-th point."""
         step = step if len(self.x) > _POINTS // step else 1
         points = [values[::step] for values in (self.x, self.y, self.u)]
         return _FieldSample(points, self.truth, self.unit)
 
     def look_up(self, readings: Sequence[Reading]) -> None:
-        """Find the truth for many readings at once, which is quicker than for one after another."""
+        """Compute the truth for many readings at once, which is faster than one by one."""
         by_place = {reading.place: reading for reading in readings}
         new = {place: r for place, r in by_place.items() if place not in self._known}
         if new:
@@ -257,22 +257,22 @@ class _FieldSample:
             self._known |= dict(zip(new, np.split(true, len(new)), strict=True))
 
     def errors(self, reading: Reading) -> FloatArray:
-        """(n, 2) of the numbers in the file, were they to hold the truth by that reading [px].
+        """(n, 2) numbers in the file minus those the truth would give with the reading [px].
 
-        All readings have the same noise in their errors, also those that scale displacements. NaN
-        where a point would be off the material.
+        So the noise in the errors is the same for all readings, also those that scale
+        displacements. NaN where the reading puts a point outside the material.
         """
         self.look_up([reading])
         written = self._known[reading.place] @ reading.components / reading.scale
         return np.asarray((self.u - written) / self.unit)
 
     def cost(self, reading: Reading) -> float:
-        """Mean length of the errors, each bounded; the bound where a point is off [px]."""
+        """Mean length of the errors, each capped; the cap for points outside the material [px]."""
         length = np.nan_to_num(_length(self.errors(reading)), nan=np.inf)
         return float(np.minimum(length, self.cap).mean())
 
     def best(self, readings: Sequence[Reading]) -> list[Reading]:
-        """Those with the smallest errors."""
+        """The readings with the smallest errors."""
         self.look_up(readings)
         return sorted(readings, key=self.cost)[:_KEPT]
 
@@ -281,19 +281,19 @@ class _FieldSample:
         return reading.scale * float(np.nanmedian(_length(self.errors(reading))))
 
     def is_rejected(self, one: Reading, other: Reading) -> bool:
-        """Whether a reading's errors hold what it differs by from another, beyond chance.
+        """Whether the errors of ``one`` significantly contain its difference from ``other``.
 
-        The errors e of the one are fitted by c d, with d what the readings differ by: c is 0 if
-        the one is right, 1 if the other is. So it must be, too, where affine parts are taken out of
-        e and d: a lens or a tilted camera leaves such errors. A mere difference of origin is
-        distinguished from a bias by how the motion varies from point to point.
+        The errors e of ``one`` are fitted by c d, where d is the difference of the readings: c is 0
+        if ``one`` is right, 1 if ``other`` is. c must be 1 also without the affine parts of e and
+        d, as a lens or a tilted camera causes affine errors. A mere difference of origin is
+        distinguished from a bias by the variation of the motion between points.
         """
         mine, others = self.errors(one), self.errors(other)
         known = np.isfinite(mine - others).all(axis=1)
         if not np.isfinite(others).any() or not self.cost(one) - self.cost(other) > _SMALL_PX:
             return False
         if not known.any():
-            return True  # nowhere on the material but by the other one
+            return True  # only the other reading puts points on the material
         mine, others, block = mine[known], others[known], self.block[known]
         if one.orientation == other.orientation:
             mine, others = (error - np.median(error, axis=0) for error in (mine, others))
@@ -302,7 +302,7 @@ class _FieldSample:
             return False
         size = np.minimum(_length(mine), _length(others))
         bound = 3.0 * float(np.median(size)) + 1e-9
-        weight = bound / np.maximum(size, bound)  # little for outliers
+        weight = bound / np.maximum(size, bound)  # low weight for outliers
         share, sd = _share(mine, mine - others, weight, block)
         affine = np.column_stack([np.ones(len(block)), self.x[known], self.y[known]])
         mine, others = (_less(error, affine, weight) for error in (mine, others))
@@ -317,7 +317,7 @@ class _FieldSample:
 def _share(
     error: FloatArray, effect: FloatArray, weight: FloatArray, block: NDArray[np.intp]
 ) -> tuple[float, float]:
-    """How much of an effect is in errors (n, 2) [-], and its standard error by that of blocks."""
+    """Share of an effect in errors (n, 2) [-], and its standard error from the blocks' scatter."""
     along, square = (
         np.bincount(block, weight * (either * effect).sum(axis=1)) for either in (error, effect)
     )
@@ -328,13 +328,13 @@ def _share(
 
 
 def _less(error: FloatArray, columns: FloatArray, weight: FloatArray) -> FloatArray:
-    """(n, 2) what a weighted fit by columns (n, m) leaves of errors."""
+    """(n, 2) residual of a weighted fit of errors by columns (n, m)."""
     root = np.sqrt(weight)[:, None]
     return error - columns @ np.linalg.lstsq(root * columns, root * error, rcond=None)[0]
 
 
 def _blocks(x: FloatArray, y: FloatArray) -> NDArray[np.intp]:
-    """(n,) number of the block that each point lies in; of four points or more on average."""
+    """(n,) number of each point's block; blocks have four points or more on average."""
     side = max(1, min(_BLOCKS, int(np.sqrt(len(x) / 4))))
     col, row = (
         np.minimum((side * (at - at.min()) / max(np.ptp(at), 1e-300)).astype(int), side - 1)

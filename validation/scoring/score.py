@@ -1,7 +1,7 @@
 """Scores of displacement fields: errors by region and by wavelength, ranking, comparison.
 
-Errors of a displacement measurement differ from one region to the next: subsets stick out over
-edges, ligaments bend, junctions turn almost rigidly, the bulk hardly moves. Scores of several
+Errors of a displacement measurement differ between regions: subsets extend beyond edges,
+ligaments bend, junctions rotate almost rigidly, the bulk hardly moves. Scores of several
 fields of one image are compared in a :class:`Grading`, for ``scores.json`` and ``scores.csv``.
 """
 
@@ -29,18 +29,18 @@ from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 EDGES, LIGAMENTS, JUNCTIONS, BULK = REGIONS = ("edges", "ligaments", "junctions", "bulk")
 Labels = NDArray[np.int8]
 EDGE_PX = 10
-"""Material closer than this to a hole or to the outside counts as edge [px]."""
+"""Material closer than this to a hole or to the outer boundary counts as edge [px]."""
 
 
 def regions(mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int = EDGE_PX) -> Labels:
     """(rows, cols) index of every pixel into :data:`REGIONS`, -1 where there is no material.
 
-    Edges come first, then what lies outside the cellular part (bulk); the rest belongs to the
-    ligament or junction whose middle is nearest. ``mask``: (rows, cols) True on material of the
-    undeformed ``specimen``, of small scatter; ``edge_px``: width of the edges [px].
+    Edges come first, then material outside the cellular part (bulk); the rest belongs to the
+    ligament or junction whose centre is nearest. ``mask``: (rows, cols) True on material of the
+    undeformed ``specimen``, with little scatter of holes; ``edge_px``: width of the edges [px].
     """
     labels = np.full(grid.shape, -1, dtype=np.int8)
-    # A pixel on the boundary belongs to the cellular part, however its position was rounded.
+    # A pixel on the boundary belongs to the cellular part, whatever the rounding of its position.
     a, b = (size + 1e-9 * specimen.pitch for size in specimen.cellular_half_size)
     cellular = (np.abs(grid.y)[:, None] <= b) & (np.abs(grid.x)[None, :] <= a)
     labels[mask & ~cellular] = REGIONS.index(BULK)
@@ -51,8 +51,8 @@ def regions(mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int =
 
 
 def _nearest(specimen: Specimen, points: FloatArray) -> Labels:
-    """Whether the middle of a ligament or of a junction is nearest to points (n, 2) [mm]."""
-    # From the nearest hole's centre, in the quarter of its cell where both are positive.
+    """Region index of points (n, 2) [mm]: the ligament or junction whose centre is nearest."""
+    # Relative to the nearest hole's centre, mirrored to the quarter of its cell with x, y > 0.
     quarter = np.abs(points - specimen.hole_centres[specimen.nearest_hole(points)])
     ligament, junction = (
         np.min([np.hypot(*(quarter - place).T) for place in places], axis=0)
@@ -63,12 +63,12 @@ def _nearest(specimen: Specimen, points: FloatArray) -> Labels:
 
 
 _ENOUGH_POINTS = 20_000
-"""For a median or a share."""
+"""Sample size for a median or a share."""
 _SAME_PX = 1e-3
-"""Points no farther from each other are one [px]."""
+"""Points that are closer than this count as one [px]."""
 PERCENTILES = (50, 90, 95, 99)
 ENOUGH_COVERED = 0.5
-"""Share of the material that a field has to cover to be ranked by its error alone [-]."""
+"""Share of the material that a field must cover to be ranked by its error alone [-]."""
 
 
 @dataclass(frozen=True)
@@ -81,15 +81,15 @@ class RegionScore:
     bias_px: tuple[float, float]
     """Mean error (x, y) [px]."""
     rms_px: float
-    """Per component [px]."""
+    """Rms error per component [px]."""
     percentiles_px: tuple[float, ...]
-    """Of the error's length, at :data:`PERCENTILES` [px]."""
+    """Percentiles :data:`PERCENTILES` of the error's length [px]."""
     max_px: float
-    """Of the error's length [px]."""
+    """Largest length of the error [px]."""
 
     @classmethod
     def of(cls, error_px: FloatArray, valid: BoolArray) -> RegionScore:
-        """From (n, 2) errors of n points, of which those that are not valid count as lost."""
+        """From errors (n, 2) of n points; points that are not ``valid`` (n,) count as lost."""
         found = error_px[valid]
         nan = float("nan")
         if not len(found):
@@ -105,7 +105,7 @@ class RegionScore:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """A graded field."""
+    """Errors of a graded field."""
 
     source: str
     everywhere: RegionScore
@@ -113,31 +113,31 @@ class Score:
     by_region: Mapping[str, RegionScore]
     """For each of :data:`REGIONS`."""
     off_material: int
-    """Points beside the material, not graded."""
+    """Number of points outside the material, not graded."""
     spacing_px: float
-    """Of the points on material; of those at the same place, one counts [px]."""
+    """Spacing of the points on material; coinciding points count once [px]."""
     reach_px: float
-    """How far from a point its displacement stands for others, one spacing if that is within the
-    reach given [px]."""
+    """Distance up to which a point represents its neighbourhood: one spacing, at most the given
+    reach [px]."""
     near: BoolArray
     """(rows, cols) True on material within reach of a valid point."""
     covered: float
     """Share of the material that is near [-]."""
     x: FloatArray
     y: FloatArray
-    """(m,) of the valid points on material [mm]."""
+    """(m,) positions of the valid points on material [mm]."""
     error_px: FloatArray
-    """(m, 2) at these points [px]."""
+    """(m, 2) errors at these points [px]."""
 
     def over(self, where: BoolArray, grid: PixelGrid) -> RegionScore:
-        """The error of the measured points in a part of the image (rows, cols)."""
+        """The error of the valid points where ``where`` (rows, cols) is True."""
         row, col = (np.rint(i).astype(int) for i in grid.to_px(self.x, self.y))
         inside = where[row, col]
         return RegionScore.of(self.error_px[inside], np.ones(inside.sum(), dtype=np.bool_))
 
 
 def ranked(scores: Sequence[Score]) -> list[Score]:
-    """The best first: by rms; after all others those that cover too little of the material."""
+    """The scores by ascending rms; fields that cover too little of the material come last."""
     return sorted(
         scores,
         key=lambda s: (s.covered < ENOUGH_COVERED, np.nan_to_num(s.everywhere.rms_px, nan=np.inf)),
@@ -153,9 +153,9 @@ def score(
 ) -> Score:
     """Grade a field of displacements at points of the reference [mm].
 
-    ``truth``: (n, 2) true displacements at these points [mm], NaN off the material; ``labels``:
-    (rows, cols) of :func:`regions`; ``grid``: the reference image's pixels; ``reach_px``: farthest
-    from a point that its displacement can stand for [px]. InputError if none is on the material.
+    ``truth``: (n, 2) true displacements at these points [mm], NaN outside the material; ``labels``:
+    (rows, cols) of :func:`regions`; ``grid``: the reference image's pixels; ``reach_px``: largest
+    distance that a point represents [px]. InputError if no point is on the material.
     """
     here = _labels_at(field.x, field.y, labels, grid)
     _require_on_specimen(field, labels, grid)
@@ -181,7 +181,7 @@ def score(
 
 
 def _labels_at(x: FloatArray, y: FloatArray, labels: Labels, grid: PixelGrid) -> Labels:
-    """(n,) labels of the pixels nearest to positions [mm]; -1 off the image."""
+    """(n,) labels of the pixels nearest to positions [mm]; -1 outside the image."""
     row, col = grid.to_px(x, y)
     inside = np.ones(x.shape, dtype=np.bool_)
     for at, count in ((row, grid.rows), (col, grid.cols)):
@@ -192,7 +192,7 @@ def _labels_at(x: FloatArray, y: FloatArray, labels: Labels, grid: PixelGrid) ->
 
 
 def _require_on_specimen(field: LocalField, labels: Labels, grid: PixelGrid) -> None:
-    """Recognise positions in another unit, or beside the specimen."""
+    """Raise InputError for positions in another unit or frame, or outside the specimen."""
     some = slice(None, None, -(-field.x.size // _ENOUGH_POINTS))
     own_x, own_y = field.x[some], field.y[some]
 
@@ -222,16 +222,16 @@ def _require_on_specimen(field: LocalField, labels: Labels, grid: PixelGrid) -> 
 
 
 def _spacing_px(x: FloatArray, y: FloatArray, grid: PixelGrid) -> float:
-    """Median distance of a point from the nearest elsewhere [px]; infinite if there is none."""
+    """Median distance of a point from its nearest distinct point [px]; infinite if none."""
     points = np.column_stack(grid.to_px(x, y))
     distance = _to_nearest(points)
-    if (distance < _SAME_PX).any():  # some are there twice
+    if (distance < _SAME_PX).any():  # some points coincide
         distance = _to_nearest(np.unique(np.rint(points / _SAME_PX), axis=0) * _SAME_PX)
     return float(np.median(distance))
 
 
 def _to_nearest(points: FloatArray) -> FloatArray:
-    """(m,) distances of some of n points (n, 2) from their nearest neighbours."""
+    """(m,) distances of a sample of points (n, 2) from their nearest neighbours."""
     if len(points) < 2:
         return np.array([np.inf])
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
@@ -240,33 +240,33 @@ def _to_nearest(points: FloatArray) -> FloatArray:
 
 
 BANDS_AN_OCTAVE = 3
-_MOST = 1000  # points along the longer side: finer fields are averaged to so many
+_MOST = 1000  # points along the longer side; finer fields are averaged
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorSpectrum:
-    """The error by wavelength, in thirds of an octave."""
+    """Spectrum of the error over the wavelength, in thirds of an octave."""
 
     wavelength_px: FloatArray
-    """(m,) middle of each band, ascending [px]."""
+    """(m,) centre of each band, ascending [px]."""
     rms_px: FloatArray
-    """(m,) rms error per component in it [px]. The squares of all and of ``affine_px`` add up to
-    that of the whole error, but for what bins of a fine field average out."""
+    """(m,) rms error per component in each band [px]. The squares of all bands and of ``affine_px``
+    add up to the square of the whole error, except for what averaging a fine field removes."""
     affine_px: float
     """Rms of the error's affine part [px]."""
 
 
 def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
-    """Decompose a field's error; None where its points don't fill a box.
+    """Decompose a field's error by wavelength; None if its points don't fill a box.
 
-    Gaps, at holes and where points were lost, count as zero error: what the pattern of gaps does
-    to a wave is spread over its neighbours.
+    Gaps, at holes and where points were lost, count as zero error. The pattern of gaps spreads the
+    error of a wavelength over neighbouring wavelengths.
     """
     if not len(graded.x):
         return None
     try:
         u, regular, mask = gridded(_averaged(graded, grid))
-        unit = 10.0 * regular.pixel_size  # any: wavelengths are in px
+        unit = 10.0 * regular.pixel_size  # arbitrary: wavelengths are in px
         spectrum = spectral_density(u, regular, mask, unit, bins_per_cell=10, padding=1)
     except InputError:
         return None
@@ -288,13 +288,13 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
 
 
 def _averaged(graded: Score, grid: PixelGrid) -> LocalField:
-    """The error as a field [mm], its points averaged over squares where there are too many."""
+    """The error as a field [mm], averaged over squares if it has too many points."""
     x, y, error = graded.x, graded.y, graded.error_px * grid.pixel_size
     step = graded.spacing_px * grid.pixel_size
     many = int(np.ceil(max(np.ptp(x), np.ptp(y)) / (step * _MOST)))
     if many > 1:
         side = many * step
-        left, low = (at.min() - 0.5 * step for at in (x, y))  # no point of a grid on a border
+        left, low = (at.min() - 0.5 * step for at in (x, y))  # no grid point on a square's border
         col, row = (((at - begin) / side).astype(int) for at, begin in ((x, left), (y, low)))
         cols = int(col.max()) + 1
         square = row * cols + col
@@ -317,19 +317,19 @@ class Grading:
 
     truth: BenchmarkTruth
     strain: float
-    """Of the image [-]."""
+    """Nominal strain of the image [-]."""
     edge_px: int
-    """Width of the region of edges [px]."""
+    """Width of the edge region [px]."""
     labels: Labels
-    """(rows, cols) of :func:`regions`."""
+    """(rows, cols) labels from :func:`regions`."""
     scores: tuple[Score, ...]
-    """The best first."""
+    """Scores, the best first."""
     spectra: Mapping[str, ErrorSpectrum | None]
-    """Of each field's error, by its name."""
+    """Spectrum of each field's error, by the field's name."""
     remarks: tuple[str, ...] = ()
-    """Probable errors in what was declared."""
+    """Texts about probable errors in the declared conventions."""
     refused: Mapping[str, str] = field(default_factory=dict)
-    """Why a field was not graded, by its file's name."""
+    """Reasons why fields were not graded, by file name."""
 
     @cached_property
     def _covered(self) -> BoolArray:
@@ -338,7 +338,7 @@ class Grading:
 
     @cached_property
     def common(self) -> dict[str, RegionScore]:
-        """By name, the error over the material that all fields cover."""
+        """The error of each field, by name, over the material that all fields cover."""
         grid = self.truth.grid
         return {graded.source: graded.over(self._covered, grid) for graded in self.scores}
 
@@ -348,13 +348,13 @@ class Grading:
         return float(self._covered.sum() / (self.labels >= 0).sum())
 
     def parts(self, graded: Score) -> dict[str, RegionScore]:
-        """A field's rows of the table: everywhere, where all measure, by region."""
+        """A field's table rows: everywhere, where all fields cover the material, by region."""
         common = {COMMON: self.common[graded.source]} if len(self.scores) > 1 else {}
         return {EVERYWHERE: graded.everywhere, **common, **graded.by_region}
 
     @property
     def notes(self) -> list[str]:
-        """What a reader has to know."""
+        """Notes for the reader: refused fields, remarks, poor coverage."""
         return [
             *(f"not graded: {why}" for why in self.refused.values()),
             *self.remarks,
@@ -365,7 +365,7 @@ class Grading:
 
 
 def grading_summary(grading: Grading) -> dict[str, Any]:
-    """The grades as plain values: for each field, the best first, all that is known of it."""
+    """The grades as plain values: all numbers of each field, the best first."""
     fields = [
         {"name": graded.source, "points_off_material": graded.off_material,
          "spacing_px": graded.spacing_px, "covered": graded.covered, **grading.parts(graded),

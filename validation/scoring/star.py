@@ -4,18 +4,18 @@ With the row i down and the column j, in px, from the centre of the upper left p
 
     v(i, j) = A cos(2 pi (i - c) / p(j)) down,  u = 0,  p(j) = p_1 + (p_2 - p_1) j / (cols - 1),
 
-c the centre row: there the motion is A at all columns, and what a code measures along it, over A,
-is how much of a wave of each period it sees. By default 4000 x 501 px, A = 0.5 px, periods from 10
+with c the centre row. There the motion is A at all columns; the displacement measured there, over
+A, is the transfer function by period. By default 4000 x 501 px, A = 0.5 px, periods from 10
 to 300 px, as in P. L. Reu et al., Exp. Mech. 62 (2022) 639, doi 10.1007/s11340-021-00806-6.
 
-The displacement belongs to points of the *reference*: a deformed pixel shows the point X with
-X + u(X) = x, found to rounding, where the speckle is evaluated, not interpolated. In a folder::
+The displacement is a function of *reference* points: a deformed pixel x shows the point X with X +
+u(X) = x, found to rounding, where the speckle is evaluated, not interpolated. Files in a folder::
 
     DIR/reference.tif deformed.tif                          exact, float
-        reference_1pct.tif still_1pct.tif deformed_1pct.tif a camera's, for each level of noise
+        reference_1pct.tif still_1pct.tif deformed_1pct.tif camera images, for each noise level
         star.json README.md
 
-Nothing is secret: the displacement is a formula. The set's id is a digest of its files.
+The truth is public: the displacement is a formula. The set's id is a digest of its files.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from modeharvest.util.typed import made
 from modeharvest.validation.scoring.benchmark import set_record
 
 KEPT = 0.9
-"""Share of the amplitude that comes back at the finest period: an attenuation of 10 % [-]."""
+"""Share of the amplitude measured at the finest period: an attenuation of 10 % [-]."""
 _BYTES_PER_PIXEL = 300.0
-"""Of making the images."""
+"""Memory for making the images [bytes/px]."""
 _STEEPEST = 0.9
 """Largest derivative of the motion, 2 pi A / p [-]: at 1 the image folds."""
 _NEAR = 1e-3
-"""From here on Newton's method converges [px]."""
+"""Distance from the solution within which Newton's method converges [px]."""
 
 
 @dataclass(frozen=True)
 class Star:
-    """The wave and the image it is in; InputError if that would nearly fold, or is too small."""
+    """The wave and its image; InputError if the image would nearly fold, or is too small."""
 
     rows: int = 501
     cols: int = 4000
@@ -82,12 +82,12 @@ class Star:
 
     @property
     def centre_row(self) -> int:
-        """The row where the motion is A everywhere."""
+        """The row where the motion is A at all columns."""
         return self.rows // 2
 
     @property
     def grid(self) -> PixelGrid:
-        """The pixels, with a px for the unit of length: x = column, y = 0 at the centre row, up."""
+        """The pixels, with lengths in px: x = column; y points up and is 0 at the centre row."""
         return PixelGrid(self.rows, self.cols, 1.0, 0.0, float(self.centre_row))
 
     def period(self, col: ArrayLike) -> FloatArray:
@@ -101,20 +101,20 @@ class Star:
         return np.asarray((self.cols - 1) * share, dtype=np.float64)
 
     def down(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """v, positive down, at points of the reference (row, col) that broadcast together [px]."""
+        """v, positive down, at reference points (row, col) that broadcast together [px]."""
         phase = 2.0 * np.pi * np.subtract(row, self.centre_row) / self.period(col)
         return np.asarray(self.amplitude_px * np.cos(phase))
 
     def displacement(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """(..., 2) u along x and up at points of :attr:`grid` (...) [px]."""
+        """(..., 2) displacement along x and y (up) at points (...) of :attr:`grid` [px]."""
         v = self.down(np.subtract(self.centre_row, y), x)
         return np.stack([np.zeros_like(v), -v], axis=-1)
 
     def came_from(self) -> tuple[FloatArray, float]:
-        """(rows, cols) row X that each deformed pixel shows, and max |X + v(X) - x|, both in px.
+        """(rows, cols) reference row X of each deformed pixel, and max |X + v(X) - x|, both in px.
 
-        The fixed point of X = x - v(X), which each step brings nearer by 2 pi A / p at least, then
-        Newton's steps down to rounding; columns stay what they are.
+        Fixed-point iteration of X = x - v(X), in which the error shrinks at least by the factor
+        2 pi A / p, then Newton steps down to rounding; columns don't change.
         """
         row = np.arange(self.rows, dtype=np.float64)[:, None]
         wave = 2.0 * np.pi / self.period(np.arange(self.cols))
@@ -124,7 +124,7 @@ class Star:
             phase = wave * (point - self.centre_row)
             error = point + self.amplitude_px * np.cos(phase) - row
             largest = float(np.abs(error).max())
-            if largest >= 0.5 * before:  # Newton's steps have come down to rounding
+            if largest >= 0.5 * before:  # Newton's method has reached rounding
                 return point, largest
             if largest < _NEAR:
                 error /= 1.0 - self.amplitude_px * wave * np.sin(phase)
@@ -153,22 +153,22 @@ _ROLES = {
     "still": "the same again, with other noise",
     "deformed": "after it",
 }
-"""Of the images of a level of noise."""
+"""Text on each image of a noise level."""
 
 
 @dataclass(frozen=True)
 class StarSpec:
-    """What a star set holds; InputError if a level comes twice or is out of range."""
+    """Content of a star set; InputError if a noise level occurs twice or is out of range."""
 
     star: Star = field(default_factory=Star)
     speckle: SpeckleSpec = field(default_factory=fine_speckle)
     noise: tuple[float, ...] = (0.01,)
-    """Standard deviations of the white noise in the camera's images [fraction of full scale]; 0.01
+    """Standard deviations of the white noise in the camera images [fraction of full scale]; 0.01
     is 2.6 of 255 levels."""
     bits: int = 8
-    """Of these images."""
+    """Bit depth of the camera images."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", tuple(self.noise))
@@ -202,7 +202,7 @@ class StarSet:
 
 
 def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silent) -> StarSet:
-    """Write a star set; a whole one of the same spec is left as it is."""
+    """Write a star set; a complete set of the same spec is kept."""
     folder = Path(folder)
 
     def work() -> list[Path]:
@@ -227,13 +227,13 @@ def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silen
 
 
 def image_name(role: str, noise: float | None = None) -> str:
-    """The file of an image: an exact one, or one of a level of noise, _1pct or _0p5pct."""
+    """File name of an exact image, or of an image with noise, with _1pct or _0p5pct."""
     level = "" if noise is None else f"_{100.0 * noise:g}pct".replace(".", "p")
     return f"{role}{level}.tif"
 
 
 def _images(spec: StarSpec, f: FloatImage, g: FloatImage) -> Iterator[tuple[str, NDArray[Any]]]:
-    """All images with the names of their files."""
+    """All images with their file names."""
     yield from ((image_name("reference"), f), (image_name("deformed"), g))
     for noise in spec.noise:
         camera = Sensor(read_noise=noise, read_seed=spec.seed)

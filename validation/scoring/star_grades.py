@@ -1,18 +1,18 @@
 """Grades on the star: attenuation, noise floor, and the metrological efficiency indicator.
 
-At every column the returned displacements are set against the true ones by least squares through
-the origin: their slope is the share of the wave that is left, T. Along the centre row alone that is
-the measured over the true amplitude, as in the DIC Challenge; other rows, up to half a period away,
-make it less noisy. Over the columns T is smoothed by local quadratic regression in the logarithm
-of the period. A smoothed value's standard error comes from the scatter of the columns about the
-curve, neighbours as dependent as their autocorrelation.
+At every column, the returned displacements are fitted to the true ones by least squares through the
+origin. The slope is the transfer T, the measured share of the wave. Along the centre row alone, it
+is the measured over the true amplitude, as in the DIC Challenge; other rows, up to half a period
+away, reduce its noise. Over the columns, T is smoothed by local quadratic regression in the
+logarithm of the period. The standard error of a smoothed value follows from the columns' scatter
+about the curve and its autocorrelation between neighbours.
 
-    l10    the period at which 10 % of the amplitude are lost [px]
+    l10    the period at which 10 % of the amplitude is lost [px]
     n      standard deviation of v between two images without motion [px]
-    n l10  the indicator [px^2]; the less, the better
+    n l10  the indicator [px^2]; lower is better
 
-A larger subset raises l10 as its edge w and lowers n as 1/w, so that the indicator rates a code and
-its shape functions rather than the choice of w. Sources: M. Grédiac, B. Blaysat, F. Sur, Exp. Mech.
+A larger subset edge w raises l10 as w and lowers n as 1/w, so the indicator rates a code and its
+shape functions rather than the choice of w. Sources: M. Grédiac, B. Blaysat, F. Sur, Exp. Mech.
 57 (2017) 871, doi 10.1007/s11340-017-0279-x; P. L. Reu et al., doi 10.1007/s11340-021-00806-6.
 """
 
@@ -37,31 +37,31 @@ RESOLUTION_FORMAT = "modeharvest-resolution-1"
 _WIDTH = 0.35
 """Half width of the local regression, in the logarithm of the period."""
 _FEWEST_COLUMNS = 20
-"""In a local regression, and for a field to be graded at all."""
+"""Least number of columns in a local regression, and of a field to be graded."""
 _POINTS = 240
-"""Periods of the curve."""
+"""Number of periods of the curve."""
 _SPAN = 3.0
-"""Ratio of the longest to the shortest period that a field has to cover at least."""
+"""Least ratio of the longest to the shortest period that a field must cover."""
 _NO_MORE = 0.05
-"""An autocorrelation below this ends the memory."""
+"""The sum of autocorrelations ends where they fall below this."""
 _CHALLENGE_DEGREE = 12
-"""Of the polynomial that the DIC Challenge smooths its centre row with."""
+"""Degree of the polynomial with which the DIC Challenge smooths its centre row."""
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """T at every column of a field, (m,) each, by ascending period."""
+    """Transfer T at every column of a field, (m,) each, by ascending period."""
 
     period: FloatArray
-    """Of the wave there [px]."""
+    """Period of the wave at the column [px]."""
     share: FloatArray
     """T [-]."""
     weight: FloatArray
-    """Sum of the squared true displacements that T rests on [px^2]."""
+    """Sum of the squared true displacements from which T is computed [px^2]."""
 
     @classmethod
     def of(cls, star: Star, field: LocalField, rows: BoolArray) -> Columns:
-        """From the valid points of a field (in px, on the star's grid) that ``rows`` (n,) names."""
+        """From a field's valid points (in px, on the star's grid) where ``rows`` (n,) is True."""
         used = field.good & rows
         x, y, v = field.x[used], field.y[used], field.u[used, 1]
         true = star.displacement(x, y)[:, 1]
@@ -76,16 +76,16 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class Attenuation:
-    """A field's curve T over the period."""
+    """A field's transfer T over the period."""
 
     columns: Columns
-    """From all rows within half a period of the centre."""
+    """T from all rows within half a period of the centre."""
     centre: Columns
-    """From the centre row, or the row next to it, alone."""
+    """T from the centre row alone, or from the nearest row."""
 
     @classmethod
     def of(cls, star: Star, field: LocalField) -> Attenuation:
-        """Of a field in px on the star's grid; InputError if columns are few or have no wave."""
+        """From a field in px on the star's grid; InputError with few columns or without wave."""
         with np.errstate(invalid="ignore"):
             inside = (field.x >= -0.5) & (field.x <= star.cols - 0.5)
             near = inside & (np.abs(field.y) <= 0.5 * star.period(field.x))
@@ -103,7 +103,7 @@ class Attenuation:
 
     @cached_property
     def curve(self) -> tuple[FloatArray, FloatArray]:
-        """(n,) smoothed T and its standard error [-] at ``period``; NaN where columns are few."""
+        """(n,) smoothed T and its standard error [-] at ``period``; NaN with too few columns."""
         return _smoothed(self.columns, self.period)
 
     @cached_property
@@ -124,7 +124,7 @@ class Attenuation:
 
     @cached_property
     def safe_px(self) -> float:
-        """The period from which on T stays above 0.9 [px]; NaN if there is none."""
+        """The period above which T stays above 0.9 [px]; NaN if there is none."""
         period, share = self._known
         below = np.flatnonzero(share < KEPT)
         if not len(below) or below[-1] == len(share) - 1:
@@ -133,9 +133,9 @@ class Attenuation:
 
     @cached_property
     def challenge_px(self) -> float:
-        """l10 as in the DIC Challenge: a polynomial of degree 12 through the centre row's T at 0.9.
+        """l10 as in the DIC Challenge [px]: where a polynomial of degree 12 fitted to T is 0.9.
 
-        NaN if it never is, or the row has too few points.
+        T is from the centre row. NaN if it doesn't reach 0.9, or the row has too few points.
         """
         at, share = self.centre.period, self.centre.share
         if len(at) <= 4 * _CHALLENGE_DEGREE:
@@ -146,7 +146,7 @@ class Attenuation:
 
     @cached_property
     def ripple(self) -> float:
-        """Rms of the centre row's T about the curve above l10 [-]: noise, pattern-induced bias."""
+        """Rms deviation of the centre row's T from the curve above l10 [-]: noise and PIB."""
         expected = np.interp(self.centre.period, self.period, self.curve[0])
         long = self.centre.period > np.nan_to_num(self.finest_px, nan=0.0)
         left = (self.centre.share - expected)[long]
@@ -158,13 +158,13 @@ class Attenuation:
 
     @property
     def _known(self) -> tuple[FloatArray, FloatArray]:
-        """Periods and T where there are columns enough for T."""
+        """Periods and T where there are enough columns."""
         known = np.isfinite(self.curve[0])
         return self.period[known], self.curve[0][known]
 
 
 def first_rise(period: FloatArray, share: FloatArray) -> float:
-    """The first period at which a curve rises through 0.9, linear between its points; or NaN."""
+    """The first period at which a piecewise linear curve rises through 0.9; NaN if none."""
     known = np.isfinite(share)
     p, t = period[known], share[known]
     rises = np.flatnonzero((t[:-1] < KEPT) & (t[1:] >= KEPT))
@@ -185,7 +185,7 @@ def _smoothed(columns: Columns, period: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def _regression(offset: FloatArray, weight: FloatArray) -> FloatArray:
-    """(m,) what each column counts in the fitted value at offset 0; NaN where there are few."""
+    """(m,) weight of each column in the fitted value at offset 0; NaN with too few columns."""
     near = np.clip(1.0 - np.abs(offset / _WIDTH) ** 3, 0.0, None) ** 3 * weight
     if np.count_nonzero(near) < _FEWEST_COLUMNS:
         return np.full(offset.shape, np.nan)
@@ -195,7 +195,7 @@ def _regression(offset: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _memory(left: FloatArray) -> float:
-    """Correlation length of neighbouring columns: 1 + 2 sum of autocorrelations."""
+    """Correlation length of neighbouring columns [columns]: 1 + 2 sum of autocorrelations."""
     size = np.sqrt(ndimage.uniform_filter1d(left**2, max(3, len(left) // 10)))
     z = left / np.maximum(size, np.finfo(float).tiny)
     lags = len(z) // 10
@@ -205,7 +205,7 @@ def _memory(left: FloatArray) -> float:
 
 
 def _require_star(columns: Columns, star: Star, field: LocalField) -> None:
-    """Raise InputError unless the field covers enough of the wave and its longest part is there."""
+    """Raise InputError unless the field covers enough periods and shows the longest ones."""
     if len(columns.period) < _FEWEST_COLUMNS:
         raise InputError(
             f"{field.source}: expected displacements at {_FEWEST_COLUMNS} columns or more within "
@@ -243,24 +243,24 @@ class StarGrading:
 
     star_set: StarSet
     grades: tuple[StarGrade, ...]
-    """The best first."""
+    """Grades, the best first."""
     refused: Mapping[str, str] = field(default_factory=dict)
-    """Why other codes were not graded."""
+    """Reasons why other codes were not graded."""
 
     @property
     def notes(self) -> list[str]:
-        """What a reader has to know."""
+        """Notes for the reader: refused codes, and the notes of each grade."""
         refused = [f"not graded: {why}" for why in self.refused.values()]
         return [*refused, *(note for grade in self.grades for note in grade.notes)]
 
 
 @dataclass(frozen=True)
 class GradeNumbers:
-    """A code's grade in numbers, most with what heads the table's columns; NaN where not known."""
+    """A code's grade in numbers, most with a heading of the table's column; NaN if unknown."""
 
     name: str
     safe_px: float
-    """Period from which on less than 10 % are lost for good [px]."""
+    """Period above which less than 10 % is lost throughout [px]."""
     shortest_px: float
     longest_px: float
     """The shortest and the longest period measured [px]."""
@@ -278,7 +278,7 @@ class GradeNumbers:
 
     @classmethod
     def of(cls, grade: StarGrade) -> GradeNumbers:
-        """All that is known of a code."""
+        """All numbers of a code's grade."""
         found, noise = grade.attenuation, grade.noise
         shortest, longest = (float(period) for period in found.period[[0, -1]])
         return cls(
@@ -290,11 +290,11 @@ class GradeNumbers:
 
 
 GRADE_COLUMNS = headings(GradeNumbers)
-"""Of the table, by the names of the numbers."""
+"""Headings of the table's columns, by the names of the numbers."""
 
 
 def grade_numbers(grade: StarGrade) -> dict[str, Any]:
-    """A code's grade as plain values, units in the names; None where not known."""
+    """A code's grade as plain values, with units in the names; None if unknown."""
     return dict(to_plain(GradeNumbers.of(grade)))
 
 
@@ -322,30 +322,30 @@ def star_csv_lines(grades: Sequence[StarGrade]) -> Iterator[str]:
 
 
 _PARTS = 10
-"""Stretches of the image whose scatters give the standard error of the noise floor."""
+"""Number of image sections; their scatter gives the standard error of the noise floor."""
 _FEWEST_POINTS = 100
 _TOO_LOUD = 0.7
-"""A scatter of the field without motion above this share of the star's is no noise."""
+"""Scatter of the field without motion, relative to the star's, above which it isn't noise."""
 
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """What is measured where nothing moves."""
+    """Statistics of the displacement measured without motion."""
 
     v_px: float
     u_px: float
     """Standard deviations along y and x [px]."""
     v_se_px: float
-    """Standard error of ``v_px``, from the scatter between stretches of the image [px]."""
+    """Standard error of ``v_px``, from the scatter between sections of the image [px]."""
     mean_px: tuple[float, float]
-    """(u, v) along x and y up [px]."""
+    """Mean displacement (u, v) along x and y (up) [px]."""
     points: int
     returned: float
     """Share of the points with a displacement [-]."""
 
     @classmethod
     def of(cls, star: Star, still: LocalField) -> NoiseFloor:
-        """Of a field in px on the star's grid; InputError if points are few, or something moves."""
+        """From a field in px on the star's grid; InputError with few points, or with motion."""
         x, _, u = still.valid_points()
         if len(x) < _FEWEST_POINTS:
             few = f"{_FEWEST_POINTS} points or more without motion, got {len(x)}"
@@ -372,8 +372,8 @@ class StarGrade:
     star: Star
     moved: LocalField
     still: LocalField | None = None
-    """Fields of the deformed image and without motion, in px on the star's grid; None if there is
-    none."""
+    """Fields measured with and without motion, in px on the star's grid; ``still`` is None if not
+    measured."""
     attenuation: Attenuation = field(init=False)
     noise: NoiseFloor | None = field(init=False)
 
@@ -384,18 +384,18 @@ class StarGrade:
 
     @property
     def name(self) -> str:
-        """Of the code."""
+        """Name of the code."""
         return self.moved.source
 
     @property
     def indicator_px2(self) -> float:
-        """n l10 [px^2]; NaN if one of them isn't known."""
+        """n l10 [px^2]; NaN if n or l10 is unknown."""
         noise = float("nan") if self.noise is None else self.noise.v_px
         return noise * self.attenuation.finest_px
 
     @property
     def indicator_se_px2(self) -> float:
-        """Its standard error [px^2]."""
+        """Standard error of ``indicator_px2`` [px^2]."""
         if self.noise is None or not self.noise.v_px > 0.0:
             return float("nan")
         found, noise = self.attenuation, self.noise
@@ -404,13 +404,13 @@ class StarGrade:
 
     @cached_property
     def error_px(self) -> FloatArray:
-        """(n, 2) returned less true displacement at the points of ``moved`` [px]; NaN if lost."""
+        """(n, 2) returned minus true displacement at the points of ``moved`` [px]; NaN if lost."""
         error = self.moved.u - self.star.displacement(self.moved.x, self.moved.y)
         return np.where(self.moved.good[:, None], error, np.nan)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader has to know."""
+        """Notes for the reader about this grade."""
         found, notes = self.attenuation, []
         low, high = found.columns.period[[0, -1]]
         if not np.isfinite(found.finest_px):
@@ -435,6 +435,6 @@ class StarGrade:
 
 
 def ranked_grades(grades: Sequence[StarGrade]) -> list[StarGrade]:
-    """The best first: by the indicator; then those without one, by l10."""
+    """The grades by ascending indicator, then those without one by ascending l10."""
     numbers = attrgetter("indicator_px2", "attenuation.finest_px")
     return sorted(grades, key=lambda grade: tuple(np.nan_to_num(numbers(grade), nan=np.inf)))

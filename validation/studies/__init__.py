@@ -1,1 +1,1 @@
-"""Studies: how a measurement's error depends on initial guess, noise, options and specimen."""
+"""Studies of a measurement's error: effect of initial guess, noise, options and specimen."""

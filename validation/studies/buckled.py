@@ -1,7 +1,7 @@
 """An analytic motion of a buckled specimen with a small wave added, exactly imaged.
 
-The base is a homogeneous strain and one pattern of even amplitude, which an ansatz of any degree
-describes; what an ansatz makes of the wave is what is asked.
+The base motion is a homogeneous strain and one pattern of uniform amplitude, which an ansatz of
+any degree describes exactly. The question is how much of the wave an ansatz captures.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.workers import leave
 
 _SPACING = 0.2
-"""Of the points at which fields are compared [mm]."""
+"""Spacing of the points at which fields are compared [mm]."""
 _SPARSE = 2
 _MARGIN = 0.03
-"""Background around the specimen, as a share of its larger side."""
+"""Width of background around the specimen, relative to its larger side."""
 LARGEST = 0.04
 """max ||phi1|| of the paper's mode [-]."""
 _COARSE_STEPS, _NEWTON_STEPS, _STEPS = 20, 3, 50
 _AROUND_PX = 4
-"""A wave moves no pixel farther."""
+"""Upper bound of the displacement by a wave [px]."""
 _ENOUGH_PX = 1e-6
-"""Residual of the inversion: a thousandth of what a correlation without noise errs by."""
+"""Residual of the inversion [px]: a thousandth of the error of a correlation without noise."""
 
 
 @dataclass(frozen=True)
 class ResolutionSpec:
-    """What a resolution study measures."""
+    """Motions, degrees and noise that a resolution study measures."""
 
     buckled: BuckledMotion
     measured: tuple[int, ...]
-    """Degrees of v0 and v1 that images are measured with."""
+    """Degrees of v0 and v1 with which images are measured."""
     amplitude_px: float
-    """Of a wave [px]."""
+    """Amplitude of a wave [px]."""
     noise: float
-    """Standard deviation in each image [fraction of full scale]."""
+    """Standard deviation of the noise in each image [fraction of full scale]."""
 
     def write(self, folder: Path) -> str:
-        """Leave it for workers; returns its name."""
+        """Write the specification for workers; return its name."""
         return leave(to_plain(self), folder, "pairs/{}.json")
 
     @classmethod
     @lru_cache(maxsize=1)
     def read(cls, folder: Path, name: str) -> ResolutionSpec:
-        """What :meth:`write` left; one worker keeps it, and its images, between cases."""
+        """Read what :meth:`write` wrote; a worker keeps it, and its images, between cases."""
         return made(ResolutionSpec, read_json(folder / "pairs" / f"{name}.json"))
 
     @property
@@ -77,15 +77,15 @@ class ResolutionSpec:
 
     @property
     def sparse(self) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """(k, 2) fewer of them, and (k,) which of those lie in the cellular part."""
+        """(k, 2) a subset of ``points``, and (k,) True for those in the cellular part."""
         some = self.points[::_SPARSE]
         a, b = self.buckled.specimen.cellular_half_size
         return some, (np.abs(some[:, 0]) <= a) & (np.abs(some[:, 1]) <= b)
 
     def correlate(self, pair: ImagePair, degree: int, motion: str) -> Result:
-        """Measure a pair from what is nearly its motion, on the full images.
+        """Correlate a pair at full resolution only, from the motion without wave.
 
-        ``motion``: "buckled", or "still", without a pattern and with a fixed mode.
+        ``motion``: "buckled", or "still" for no motion, with a fixed mode.
         """
         how, is_still = self.buckled.how, motion == "still"
         ansatz = self.buckled.ansatz(degree, degree, fixed_mode=is_still)
@@ -99,15 +99,15 @@ class AddedWave:
     """A small wave of v0 or of v1."""
 
     part: str
-    """Either "v0", a motion along ``axis`` itself, or "v1", of the pattern's amplitude."""
+    """Either "v0", a displacement along ``axis``, or "v1", a change of the pattern's amplitude."""
     axis: int
-    """0 if the wave runs along x, 1 if along y."""
+    """0 if the wave varies along x, 1 if along y."""
     period: float
-    """[mm]."""
+    """Period of the wave [mm]."""
     phase: float
-    """At x = y = 0 [rad]."""
+    """Phase at x = y = 0 [rad]."""
     amplitude: float
-    """Of the displacement, for "v1" where the pattern is largest [mm]."""
+    """Amplitude of the displacement; for "v1" where the pattern is largest [mm]."""
 
     def __post_init__(self) -> None:
         if self.part not in ("v0", "v1") or self.axis not in (0, 1) or not self.period > 0.0:
@@ -115,41 +115,41 @@ class AddedWave:
             raise InputError(f"expected {wanted}, got {self.part!r}, {self.axis} and {self.period}")
 
     def shape(self, points: FloatArray) -> FloatArray:
-        """(...) the wave alone at points (..., 2) [mm], of amplitude 1 [-]."""
+        """(...) the wave with amplitude 1 at points (..., 2) [mm] [-]."""
         return np.asarray(np.cos(2.0 * np.pi / self.period * points[..., self.axis] + self.phase))
 
 
 @dataclass(frozen=True, eq=False)
 class InverseMotion:
-    """Where deformed pixels come from."""
+    """Reference points of the pixels of a deformed image."""
 
     near: BoolArray
-    """(rows, cols) the n pixels that show material, or nearly."""
+    """(rows, cols) True for the n pixels that show material or are close to it."""
     at: FloatArray
     points: FloatArray
-    """(n, 2) their positions x, and X with X + u(X) = x [mm]."""
+    """(n, 2) positions x of these pixels, and X with X + u(X) = x [mm]."""
     slope: FloatArray
-    """(n, 2, 2) dX/dx, nearly [-]."""
+    """(n, 2, 2) approximate dX/dx [-]."""
 
 
 @dataclass(frozen=True)
 class BuckledMotion:
-    """A base motion and how it is imaged and correlated."""
+    """The base motion of a specimen, its imaging and its correlation."""
 
     specimen: Specimen
     how: SquareLatticeOptions
-    """Options of the correlation, whose degrees are varied."""
+    """Options of the correlation; their degrees are varied."""
     speckle: SpeckleSpec
     pixel_size: float
-    """[mm]."""
+    """Edge of a pixel [mm]."""
     strain: float
     """Nominal compression along x [-]."""
     pattern: float
-    """v1, the same everywhere [mm]."""
+    """Uniform v1 [mm]."""
 
     @cached_property
     def grid(self) -> PixelGrid:
-        """Pixels that hold the specimen in all its states."""
+        """Pixel grid that contains the specimen in all its states."""
         half = np.array(self.specimen.half_size)
         reach = half + _MARGIN * half.max()
         cols, rows = (2 * int(np.ceil(r / self.pixel_size)) + 1 for r in reach)
@@ -157,20 +157,20 @@ class BuckledMotion:
 
     @cached_property
     def truth(self) -> tuple[Ansatz, FloatArray]:
-        """The smallest ansatz that describes the base, and its unknowns."""
+        """The ansatz of least degree that describes the base motion, and its unknowns."""
         return self.ansatz(1, 0), self.start(1, 0)
 
     def ansatz(self, v0_degree: int, v_degree: int, fixed_mode: bool = False) -> Ansatz:
-        """The paper's ansatz of these degrees; its mode fixed if the motion has none."""
+        """The paper's ansatz with these degrees; ``fixed_mode``: for motion without a pattern."""
         options = replace(self.how, v0_degree=v0_degree, v_degree=v_degree, fixed_mode=fixed_mode)
         return options.ansatz(self.specimen)
 
     def start(self, v0_degree: int, v_degree: int) -> FloatArray:
-        """The base in the unknowns of an ansatz of these degrees."""
+        """(n,) unknowns of an ansatz of these degrees that describe the base motion."""
         return self.ansatz(v0_degree, v_degree).initial_guess(self.strain, self.pattern)
 
     def material(self, x: FloatArray, y: FloatArray) -> BoolArray:
-        """Whether there is material at points of the undeformed specimen [mm] that broadcast."""
+        """Whether points of the undeformed specimen are on material; x, y [mm] broadcast."""
         s = self.specimen
         x, y = np.broadcast_arrays(x, y)
         hole = s.nearest_hole(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
@@ -192,7 +192,7 @@ class BuckledMotion:
         return ansatz.phi(0, a, points[..., None, 0], points[..., None, 1])[..., 0, :]
 
     def displacement(self, points: FloatArray, wave: AddedWave | None = None) -> FloatArray:
-        """(..., 2) base and wave at points (..., 2) [mm]."""
+        """(..., 2) displacement of base motion and wave at points (..., 2) [mm]."""
         height = np.full(points.shape[:-1], self.pattern)
         if wave is not None and wave.part == "v1":
             height += wave.amplitude / LARGEST * wave.shape(points)
@@ -203,7 +203,7 @@ class BuckledMotion:
         return np.asarray(u)
 
     def images(self, wave: AddedWave | None = None) -> ImagePair:
-        """Exact images before and after the motion."""
+        """Exact images of the reference and the deformed state."""
         still, base, grid = self.still(), self._base, self.grid
         point = base.points if wave is None else self._improved(base, wave)
         inside = self.material(point[:, 0], point[:, 1])
@@ -214,7 +214,7 @@ class BuckledMotion:
         return ImagePair(still.reference, g, grid, still.masks[0], deformed_mask)
 
     def still(self) -> ImagePair:
-        """The image before the motion, twice."""
+        """A pair without motion: the reference image twice."""
         mask = self.material(self.grid.x[None, :], self.grid.y[:, None])
         image = Speckle(self.speckle, self.grid.shape).image()
         f = np.where(mask, image, 0.0).astype(np.float32)
@@ -222,10 +222,10 @@ class BuckledMotion:
 
     @cached_property
     def _base(self) -> InverseMotion:
-        """Of the base, by fixed-point iteration and Newton's method."""
+        """Inverse of the base motion, by fixed-point iteration and Newton's method."""
         at = np.stack(np.meshgrid(self.grid.x, self.grid.y), axis=-1)
         point = at
-        for _ in range(_COARSE_STEPS):  # each brings X nearer by the largest strain
+        for _ in range(_COARSE_STEPS):  # each reduces the error by the factor of the largest strain
             point = at - self.displacement(point)
         material = self.material(point[..., 0], point[..., 1])
         near = ndimage.binary_dilation(material, iterations=_AROUND_PX)
@@ -241,7 +241,7 @@ class BuckledMotion:
         return replace(found, points=self._improved(found, None))
 
     def _improved(self, base: InverseMotion, wave: AddedWave | None) -> FloatArray:
-        """(n, 2) X from near ones, by steps of one slope."""
+        """(n, 2) X of base motion and wave, by modified Newton steps with ``base.slope`` [mm]."""
         point = base.points
         for _ in range(_STEPS):
             error = point + self.displacement(point, wave) - base.at

@@ -1,9 +1,9 @@
-"""Study of lattice modes: on what the pattern of a square lattice depends.
+"""Study of lattice modes: parameters that affect the pattern of a square lattice.
 
 The paper says that modes are independent of the size l of the unit cell, of d/l for moderate
 variations, and of the material (Section "Graded Microstructures and Size Independence of the
-Modes"). Here that is measured: a lattice's numerical mode at (π, π) against Eq. (mode) by their
-normalised overlap.
+Modes"). This study quantifies it by the normalised overlap of a lattice's numerical mode at (π, π)
+with Eq. (mode).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Key = tuple[str, str, float, float, int]
 
 @dataclass(frozen=True)
 class ModeRow:
-    """The pattern of one lattice under one loading; labels and units head the table's columns."""
+    """The pattern of one lattice under one loading; labels and units are the table's headings."""
 
     material: str = quantity("material")
     loading: str = quantity("loading")
@@ -52,31 +52,31 @@ class ModeRow:
     found: bool = quantity("critical point found")
     first: float = quantity("first critical or largest strain", "-")
     kind: str = quantity("first critical waves")
-    """What is critical first: "pattern" for (π, π) alone, "long waves", "other waves"; "none" up to
-    the largest load asked for; "path ends" where no equilibrium was found beyond."""
+    """First critical waves: "pattern" for (π, π) alone, "long waves", "other waves"; "none" if
+    nothing is critical up to the largest load; "path ends" if no further equilibrium was found."""
     pattern: float = quantity("critical strain of (pi, pi)", "-")
-    """First load at which (π, π) is critical, whatever else is; NaN if none in the range."""
+    """First load at which (π, π) is critical, alone or not; NaN if none in the range."""
     state: float = quantity("strain of the mode's state", "-")
-    """Load of the state that the mode belongs to, the first critical one or the last."""
+    """Load of the state at which the mode is computed: the first critical one, else the last."""
     eigenvalue: float = quantity("eigenvalue at (pi, pi)", "N/mm^4")
     overlap: float = quantity("overlap with Eq. (mode)", "-")
     """|<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both of unit norm over
     the material."""
     captured: float = quantity("energy captured by the automatic family", "-")
-    """Share of the mode's energy that the automatically found family holds."""
+    """Share of the mode's energy captured by the automatically found mode family."""
     waves: int = quantity("its waves", "-")
     likeness: float = quantity("overlap with the reference's mode", "-", default=math.nan)
-    """|<mode, mode of the reference>| of unit norm, on the same mesh but for its size; NaN where it
-    wasn't compared."""
+    """|<mode, mode of the reference>|, both of unit norm, on the same mesh up to its size; NaN if
+    not compared."""
 
     @property
     def key(self) -> Key:
-        """What was computed, apart from what came out."""
+        """The parameters of the computation, without its results."""
         return (self.material, self.loading, self.pitch, self.ratio, self.divisions)
 
     @property
     def is_first(self) -> bool:
-        """Whether the pattern is what buckles first."""
+        """Whether the pattern is the first mode to buckle."""
         return self.kind == "pattern"
 
 
@@ -85,12 +85,12 @@ _ROWS = TypeAdapter(tuple[ModeRow, ...])
 
 
 def write_rows(path: Path, rows: Iterable[ModeRow]) -> None:
-    """Write the table, atomically; numbers with all their digits."""
+    """Write the table atomically, with all digits."""
     write_csv(path, _HEADS.values(), ([getattr(row, name) for name in _HEADS] for row in rows))
 
 
 def read_rows(path: Path) -> tuple[ModeRow, ...]:
-    """Read what :func:`write_rows` wrote; empty without a file, InputError if it is another."""
+    """Read a file of :func:`write_rows`; empty without a file, InputError for another format."""
     if not path.exists():
         return ()
     heads, remedy = list(_HEADS.values()), "remove it to begin anew"
@@ -105,11 +105,11 @@ def read_rows(path: Path) -> tuple[ModeRow, ...]:
 
 
 PATTERN = (math.pi, math.pi)
-"""The wave of the paper's pattern, as phases from cell to cell [rad]."""
+"""The wave of the paper's pattern, as phase differences from cell to cell [rad]."""
 EQ_MODE = square_family("hole")
 """The analytic mode, Eq. (mode) of the paper; a hole's centre is the origin."""
-_STEP, _CLOSE = 0.02, 0.002  # of the load [-]
-_NARROW = 0.005  # bracket of d/l where another mode comes first [-]
+_STEP, _CLOSE = 0.02, 0.002  # step of the load [-]
+_NARROW = 0.005  # width of the bracket of d/l at which the first mode changes [-]
 LOADINGS: dict[str, MacroLoading] = {
     "uniaxial": uniaxial(), "uniaxial-strain": uniaxial_strain(), "equibiaxial": equibiaxial()
 }  # fmt: skip
@@ -131,7 +131,7 @@ STUDIED_MATERIALS: dict[str, Material] = {
 
 @dataclass(frozen=True)
 class StudiedLattice:
-    """One lattice of the study: everything that its pattern may depend on."""
+    """One lattice of the study: all parameters on which its pattern may depend."""
 
     ratio: float = 0.7895
     """Hole diameter over cell size d/l [-]."""
@@ -151,26 +151,26 @@ class StudiedLattice:
 
     @property
     def key(self) -> Key:
-        """As :attr:`ModeRow.key`."""
+        """The same as :attr:`ModeRow.key`."""
         names = name_of(self.material, STUDIED_MATERIALS), name_of(self.loading, LOADINGS)
         return (*names, self.pitch, self.ratio, self.divisions)
 
 
 @dataclass(frozen=True, eq=False)
 class PatternMode:
-    """The numerical pattern of a lattice beside the analytic one."""
+    """The numerical pattern of a lattice and the analytic one."""
 
     row: ModeRow
     mesh: Mesh
-    """The primitive cell, about a hole, a quarter of the pattern's own [mm]."""
+    """Mesh of the primitive cell around a hole, a quarter of the pattern's cell [mm]."""
     shape: FloatArray
     analytic: FloatArray
-    """(n, 2) both modes at its nodes [-]; the mean of their squared length over the material is 1,
-    their product is positive."""
+    """(n, 2) numerical and analytic mode at the nodes [-]; the mean of their squared length over
+    the material is 1, their scalar product is positive."""
 
 
 def name_of(thing: object, names: Mapping[str, object]) -> str:
-    """Its name among these; all its values where it has none."""
+    """The name of ``thing`` in ``names``; its repr if it has none."""
     return next((name for name, known in names.items() if known == thing), repr(thing))
 
 
@@ -192,10 +192,10 @@ def mode_likeness(reference: PatternMode, other: PatternMode) -> float:
 
 
 def pattern_row(lattice: StudiedLattice) -> ModeRow:
-    """Find a lattice's first critical point, and what its lowest mode at (π, π) is like.
+    """Find a lattice's first critical point and compare its lowest mode at (π, π).
 
-    The mode belongs to the first critical state, or without one to the last that was looked at.
-    Where (π, π) is not what is critical there, its eigenvalue says how far off it is.
+    The mode is computed at the first critical state, or, without one, at the last state reached.
+    If (π, π) is not critical there, its eigenvalue shows how far it is from critical.
     """
     from modeharvest.fem.bloch.critical import critical_at, first_critical
     from modeharvest.fem.bloch.real_modes import real_modes
@@ -204,7 +204,7 @@ def pattern_row(lattice: StudiedLattice) -> ModeRow:
     path, search = _path(lattice), CriticalSearch(largest=lattice.largest)
     found = first_critical(path, search)
     if not found.found and found.load < lattice.largest:
-        # The path ends within the next step, perhaps behind a critical point: look closely.
+        # The path ends within the next step, perhaps after a critical point: use small steps.
         search = CriticalSearch(largest=lattice.largest, largest_step=_CLOSE)
         found = first_critical(path, search)
     kind = kind_of(found, lattice.largest)
@@ -220,9 +220,9 @@ def pattern_row(lattice: StudiedLattice) -> ModeRow:
 
 
 def pattern_mode(lattice: StudiedLattice, row: ModeRow | None = None) -> PatternMode:
-    """The mode that a lattice's row is about; without a row, that is found first.
+    """The mode described by a lattice's row; without a row, the row is computed first.
 
-    InputError if there is no equilibrium at the row's state: it is another lattice's.
+    InputError if there is no equilibrium at the row's state: the row is another lattice's.
     """
     from modeharvest.fem.bloch.real_modes import real_modes
 
@@ -248,7 +248,7 @@ def _path(lattice: StudiedLattice) -> CellPath:
     from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
     from modeharvest.fem.lattice.cells import UnitCell, square
 
-    # Meshed for l = 1 mm and scaled: gmsh's tolerances are lengths, its meshes of other l others.
+    # Meshed for l = 1 mm and scaled: gmsh's tolerances are lengths, so its meshes depend on l.
     one = square(1.0, lattice.ratio, 1.0 / lattice.divisions)
     mesh = Mesh(lattice.pitch * one.mesh.nodes, one.mesh.cells, one.mesh.element)
     unit = UnitCell(mesh, lattice.pitch * one.lattice)
@@ -256,7 +256,7 @@ def _path(lattice: StudiedLattice) -> CellPath:
 
 
 def kind_of(found: LatticeCritical, largest: float) -> str:
-    """What is critical first up to the largest load, as in :class:`ModeRow`."""
+    """The first critical waves up to the largest load, as :attr:`ModeRow.kind`."""
     from modeharvest.fem.bloch.degenerate import is_same
 
     if not found.found:
@@ -272,35 +272,35 @@ Work = Callable[[StudiedLattice], ModeRow]
 
 @dataclass(frozen=True)
 class FirstModeLimit:
-    """Between which d/l the pattern stops being what buckles first under one loading."""
+    """Interval of d/l in which the pattern stops being the first mode under one loading."""
 
     loading: str
     without: float
     with_: float
-    """The largest d/l found at which something else comes first, and the smallest at which the
-    pattern does [-]."""
+    """The largest d/l found at which another mode is first, and the smallest at which the pattern
+    is first [-]."""
     instead: str
-    """What comes first below, as in :class:`ModeRow`."""
+    """The first critical waves below, as :attr:`ModeRow.kind`."""
 
 
 @dataclass(frozen=True, eq=False)
 class LatticeModeStudy:
-    """What came out of a study."""
+    """Results of a study of lattice modes."""
 
     ratios: tuple[ModeRow, ...] = ()
-    """Every hole size under every loading."""
+    """Rows for every hole size under every loading."""
     scales: tuple[ModeRow, ...] = ()
     materials: tuple[ModeRow, ...] = ()
-    """The reference at other l, and of other materials; each ``likeness`` is the overlap with the
-    reference's own mode."""
+    """Rows of the reference lattice with other l and with other materials; each ``likeness`` is the
+    overlap with the reference's mode."""
     limits: tuple[FirstModeLimit, ...] = ()
-    """Where the pattern stops being the first mode, for each loading where it does."""
+    """d/l at which the pattern stops being the first mode, for each loading with such a limit."""
     overlays: tuple[PatternMode, ...] = ()
-    """Modes to be laid over the analytic one."""
+    """Modes to be drawn over the analytic one."""
 
 
 class ModeTable:
-    """A CSV of rows that grows as they are computed; what it has isn't computed again.
+    """A CSV of rows, extended as they are computed; existing rows aren't computed again.
 
     ``path``: the file; None to keep the rows in memory.
     """
@@ -310,7 +310,7 @@ class ModeTable:
         self.known = {row.key: row for row in (() if path is None else read_rows(path))}
 
     def row(self, lattice: StudiedLattice, work: Work) -> ModeRow:
-        """The row of a lattice, from the table or by ``work``."""
+        """The row of a lattice, from the table or computed by ``work``."""
         if lattice.key not in self.known:
             self.known[lattice.key] = work(lattice)
             if self.path is not None:
@@ -330,7 +330,7 @@ def study_likeness(
     table: ModeTable,
     progress: Progress = silent,
 ) -> tuple[ModeRow, ...]:
-    """The rows of lattices of the reference's d/l, their modes compared with its mode."""
+    """The rows of lattices with the reference's d/l, their modes compared with its mode."""
 
     @cache
     def own() -> PatternMode:
@@ -346,10 +346,10 @@ def study_likeness(
 def first_mode_limit(
     base: StudiedLattice, loading: str, rows: Sequence[ModeRow], table: ModeTable
 ) -> FirstModeLimit | None:
-    """Bisect d/l to where the pattern stops being the first mode of a loading.
+    """Find by bisection the d/l at which the pattern stops being the first mode under a loading.
 
-    ``base``: all else about the lattice; ``rows``: known ones, to begin with. None if among them
-    there is none with the pattern first and one below with something else.
+    ``base``: the other parameters of the lattice; ``rows``: known rows, as initial bracket. None
+    unless they include one with the pattern first, and one with smaller d/l and another mode first.
     """
     known = sorted((row for row in rows if row.loading == loading), key=lambda row: row.ratio)
     below = [row for row in known if not row.is_first]
@@ -366,18 +366,18 @@ def first_mode_limit(
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """What a study asks about one lattice.
+    """Parameters that a study varies about one lattice.
 
-    Every ratio under every loading, and where the pattern stops being what buckles first; other
-    unit cell sizes and materials at the lattice's own d/l and loading.
+    Every ratio under every loading, and the limit below which the pattern isn't the first mode;
+    other unit cell sizes and materials at the lattice's own d/l and loading.
     """
 
     ratios: tuple[float, ...] = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
-    """d/l [-]: 0.7895 is the paper's; 0.8696 and 0.95 have independent values, too."""
+    """d/l [-]: 0.7895 is the paper's; for 0.8696 and 0.95 independent results exist, too."""
     loadings: tuple[str, ...] = tuple(LOADINGS)
-    """Among "uniaxial", "uniaxial-strain" and "equibiaxial"."""
+    """Loadings, among "uniaxial", "uniaxial-strain" and "equibiaxial"."""
     pitches: tuple[float, ...] = ()
-    """Other l [mm]; the mesh is scaled, too."""
+    """Other l [mm], with which the mesh is scaled."""
     materials: tuple[str, ...] = ()
     """Names among ``STUDIED_MATERIALS``."""
     overlays: tuple[float, ...] = (0.95, 0.7895, 0.25)
@@ -408,8 +408,8 @@ def run_lattice_study(
 ) -> LatticeModeStudy:
     """The whole study about one lattice: hole sizes, scales, materials, limits, overlays.
 
-    ``base``: the lattice, with the plan's divisions and largest load; ``table``: CSV that keeps the
-    rows, and that a study which was broken off goes on from.
+    ``base``: the lattice, with the plan's divisions and largest load; ``table``: CSV that stores
+    the rows, and from which an interrupted study continues.
     """
     kept = ModeTable(table)
     base = replace(base, divisions=plan.divisions, largest=plan.largest)

@@ -1,9 +1,9 @@
 """Study of measured modes: hole size, cell size, material and graded holes of buckled specimens.
 
-One case in ``specimens/NAME/`` of the study's folder, NAME the digest of the description::
+A case's files in ``specimens/NAME/`` of the study's folder, NAME the digest of the description::
 
-    specimen.json          how it is made, imaged and correlated
-    solution.h5            the exact displacement, a copy of the one in ``solutions/``
+    specimen.json          the specimen, its imaging and its correlation
+    solution.h5            the exact displacement, a copy of a file in ``solutions/``
     result.json best.json  the measurement, and the best fit of its ansatz to the truth
 """
 
@@ -40,11 +40,11 @@ from modeharvest.validation.workers import Case, Cases, Row
 PARAMETERS = tuple(f"a{k}" for k in range(1, 8))
 WAVE_VECTORS = list(PARAMETERS[1:5])
 IDEAL = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0])
-"""Eq. (mode) with a solid junction at the origin; the phases a₆ and a₇ in shares of l."""
+"""Parameters of Eq. (mode) with a solid junction at the origin; phases a₆ and a₇ divided by l."""
 NOISE = 0.01
-"""For which error bars are predicted; the images have none [fraction of full scale]."""
+"""Noise for which error bars are predicted [fraction of full scale]; the images have no noise."""
 PATTERN_SHARE = 0.8
-"""A critical mode of which less is the pattern, whatever its amplitude in each cell, is another."""
+"""Least share of the pattern, with any amplitude in each cell, in a mode that counts as it."""
 BASE = "base"
 
 
@@ -53,20 +53,20 @@ class SpecimenPatterns:
     """A specimen's fields at the nodes of its mesh, (n, 2) each [mm]."""
 
     mesh: Mesh
-    """Of T6 [mm]."""
+    """Mesh of T6 elements [mm]."""
     pitch: float
     """Unit cell size l [mm]."""
     displacement: FloatArray
     found: FloatArray
-    """The truth and the measurement."""
+    """The true and the measured displacement."""
     pattern: FloatArray
-    """The truth less the best fit's v₀."""
+    """The true displacement minus the best fit's v₀."""
     found_pattern: FloatArray
-    """v₁φ₁."""
+    """The measured v₁φ₁."""
 
     @classmethod
     def read(cls, folder: Path) -> SpecimenPatterns:
-        """Of what :func:`one_specimen` left."""
+        """From the files of :func:`one_specimen`."""
         solution = Solution.read(folder / "solution.h5")
         result, best = (Result.read(folder / f"{name}.json") for name in ("result", "best"))
         (snapshot,) = solution.snapshots
@@ -83,13 +83,13 @@ class SpecimenPatterns:
 
 
 def deviations(measured: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
-    """Parameters less those of Eq. (mode), phases in shares of l."""
+    """Parameters minus those of Eq. (mode); phases divided by l."""
     values = measured[[prefix + name for name in PARAMETERS]].to_numpy(np.float64) - IDEAL
     return pd.DataFrame(values, measured.index, list(PARAMETERS))
 
 
 def standardised_errors(measured: pd.DataFrame) -> NDArray[np.float64]:
-    """(specimens, 7) measured less best fit, in standard deviations by model error."""
+    """(specimens, 7) measured minus best-fit parameters, in standard deviations by model error."""
     sd = measured[[f"{name}_sd_model_error" for name in PARAMETERS]].to_numpy(np.float64)
     return np.asarray((deviations(measured) - deviations(measured, "best_")).to_numpy() / sd)
 
@@ -99,7 +99,7 @@ def one_specimen(case: Case, folder: Path) -> Row:
     own = folder / "specimens" / case["specimen"]
     described = SpecimenSpec.read(own / "specimen.json")
     experiment, path = described.experiment, described.solution_path(folder)
-    if not path.is_file():  # simulating costs most, and knows nothing of images
+    if not path.is_file():  # simulation takes most time, and doesn't depend on the images
         if described.given:
             raise InputError(f"expected the base's solution at {path}, found none; run it again")
         buckle(experiment, described.amplitude, described.largest).write(path)
@@ -117,11 +117,11 @@ def one_specimen(case: Case, folder: Path) -> Row:
 
 
 def _specimen_row(described: SpecimenSpec, solution: Solution, lattice: PatternMode) -> Row:
-    """What a specimen is, and how it and the infinite lattice of its cells buckle.
+    """A specimen's geometry, and the buckling of the specimen and of the infinite lattice.
 
-    ``ratio``: d/l in the middle; ``first``: what it buckles into, "pattern", "other" or "none";
+    ``ratio``: d/l at the centre; ``first``: first buckling mode, "pattern", "other" or "none";
     ``pattern_share``: the pattern's share of that mode; ``strain``: where it is measured, with
-    ``unstable_pivots`` negative ones; ``lattice_...``: ``kind``, ``pattern`` and ``overlap`` of the
+    ``unstable_pivots`` negative pivots; ``lattice_...``: ``kind``, ``pattern``, ``overlap`` of the
     lattice's :class:`~modeharvest.validation.studies.lattice.ModeRow`, and its a₁.
     """
     specimen, critical = described.specimen, solution.info.get("critical")
@@ -152,12 +152,12 @@ def _specimen_row(described: SpecimenSpec, solution: Solution, lattice: PatternM
 def _measured_row(pair: VirtualImagePair, lattice: PatternMode, own: Path) -> Row:
     """Correlate from the standard initial guess; compare with truth, best fit and lattice.
 
-    ``a1`` ... ``a7`` of the measurement and ``best_a1`` ... of the best fit, in the form nearest to
-    the ideal one, phases in shares of l; ``a1_sd_model_error`` and ``a1_sd_noise`` ...: standard
-    deviations by model error, and by noise of :data:`NOISE`. ``overlap_lattice``: of the mode, of
-    constant amplitude, with the infinite lattice's over all cells; ``overlap_truth``: of v₁φ₁ with
-    the truth less the best fit's v₀ over the cellular material; ``best_...`` the same of the best
-    fit. ``amplitude``: rms length of v₁φ₁ over the cellular material, in shares of l.
+    ``a1`` ... ``a7`` of the measurement and ``best_a1`` ... of the best fit: equivalent parameters
+    nearest to the ideal, phases divided by l; ``a1_sd_model_error`` and ``a1_sd_noise`` ...: their
+    standard deviations by model error, and by noise of :data:`NOISE`. ``overlap_lattice``: of the
+    mode with the infinite lattice's mode, both of constant amplitude, over all cells;
+    ``overlap_truth``: of v₁φ₁ with the truth minus the best fit's v₀ over the cellular material;
+    ``best_...``: of the best fit. ``amplitude``: rms length of v₁φ₁ there, divided by l.
     """
     result = pair.correlate()
     found, specimen = pair.compare(result), pair.specimen
@@ -179,12 +179,12 @@ def _measured_row(pair: VirtualImagePair, lattice: PatternMode, own: Path) -> Ro
 
 
 def _columns(values: Iterable[float], name: str) -> dict[str, float]:
-    """The mode's seven parameters under their names, which replace the {} in ``name``."""
+    """The mode's seven parameters by column name: ``name`` with {} replaced by the parameter's."""
     return {name.format(key): value for key, value in zip(PARAMETERS, values, strict=True)}
 
 
 def _patterns(found: Comparison, specimen: Specimen) -> dict[str, float]:
-    """How alike v₁φ₁ and the specimen's own pattern are, and how strong the first is."""
+    """Overlap of v₁φ₁ with the specimen's true pattern, and its amplitude."""
     inside = found.cellular(specimen)
     true = (found.displacement - found.best.v0())[inside]
     measured, best = (fit.fluctuation()[inside] for fit in (found.result, found.best))
@@ -203,24 +203,24 @@ def likeness(first: FloatArray, second: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ModesAnalysis:
-    """What the table of measured modes says, each part with a row for each specimen."""
+    """Evaluation of the table of measured modes; each part has a row for each specimen."""
 
     ran: pd.DataFrame
-    """All that succeeded."""
+    """All specimens that succeeded."""
     measured: pd.DataFrame
-    """Those whose pattern was there to be measured and was: converged on a pattern."""
+    """Specimens that buckled into the pattern and whose correlation converged on it."""
     sizes: pd.DataFrame
-    """Of these the base and those that differ from it in d/l only."""
+    """Among these, the base and the specimens that differ from it only in d/l."""
     folder: Path
-    """The study's, where the specimens are."""
+    """The study's folder, which has the specimens."""
 
 
 @dataclass(frozen=True)
 class MeasuredModesStudy(Study[ModesAnalysis]):
-    """Measure the mode on specimens that differ from a base in one respect each.
+    """Measure the mode on specimens that each differ from a base in one respect.
 
-    Each is compressed until its pattern is as strong as the base's, in shares of l. InputError if a
-    value is out of its range, or comes twice.
+    Each is compressed until its pattern's amplitude over l equals the base's. InputError if a value
+    is out of range, or occurs twice.
     """
 
     question: ClassVar[str] = (
@@ -234,19 +234,19 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
     measures_mode: ClassVar[bool] = True
 
     strain: float = 0.128
-    """Of the base's deformed image [-]; it has to be buckled there."""
+    """Nominal strain of the base's deformed image [-]; the base must be buckled there."""
     ratios: tuple[float, ...] = (0.6, 0.65, 0.7, 0.75, 0.85, 0.9, 0.95)
     """Other d/l [-]."""
     pitches: tuple[float, ...] = (0.95,)
-    """Other l [mm], with which specimen, elements and pixels are scaled."""
+    """Other l [mm]; specimen, elements and pixels are scaled with it."""
     materials: tuple[str, ...] = ("two-term-I1", "Ogden m=3, nu=0.40", "Ogden m=3, nu=0.49")
     """Names among ``STUDIED_MATERIALS``."""
     gradings_x: tuple[float, ...] = (0.02,)
     gradings_y: tuple[float, ...] = (0.02,)
-    """Change of the diameter along and across the load [mm/mm], each by itself; d at the specimen's
-    centre stays."""
+    """Gradients of the diameter along and across the load [mm/mm], one at a time; d at the
+    specimen's centre is kept."""
     largest: float = 0.28
-    """Strain up to which to look for where a specimen buckles [-]."""
+    """Strain up to which to look for a specimen's critical point [-]."""
     divisions: int = 13
     """Elements along l of the infinite lattice's cell."""
 
@@ -268,18 +268,18 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
 
     @property
     def seeds(self) -> str:
-        """The only thing that is random."""
+        """Text on the only random numbers."""
         return "one speckle, of imaging.speckle.seed"
 
     def quick(self) -> Self:
-        """A third of the d/l beside the base's, and one graded specimen."""
+        """A third of the other d/l, and one graded specimen."""
         fewer = replace(self, ratios=self.ratios[2::3], gradings_y=self.gradings_y[:1])
         return replace(fewer, pitches=(), materials=(), gradings_x=())
 
     def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
         """Describe the specimens; they are simulated and imaged case by case.
 
-        InputError if the base has no critical point below the strain, or a specimen can't be.
+        InputError if the base has no critical point below the strain, or a geometry is impossible.
         """
         base = SpecimenSpec.of(spec, self.strain, self.largest, self.divisions)
         own = replace(spec.solution, snapshots=(spec.solution.at(self.strain),))

@@ -1,7 +1,7 @@
 """Specimens of the study of measured modes: descriptions, buckling, and their lattices' modes.
 
-A description is in ``specimens/NAME/specimen.json`` of the study's folder, NAME the digest of its
-content.
+A description is in ``specimens/NAME/specimen.json`` of the study's folder, where NAME is the digest
+of its content.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from modeharvest.validation.studies.study import ImagePairSpec
 from modeharvest.validation.workers import leave
 
 _QUADRATURE = 4
-"""Points per direction: the pattern's waves are long against the elements."""
+"""Quadrature points per direction: the pattern's waves are long compared with the elements."""
 
 
 def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
-    """Compress a specimen until its pattern is as strong as wanted, by ``simulate_pattern``.
+    """Compress a specimen until its pattern has the wanted amplitude, by ``simulate_pattern``.
 
-    ``experiment``: its strains and branches are not used; ``wanted``: the pattern's amplitude to be
+    ``experiment``: its strains and branches are ignored; ``wanted``: the pattern's amplitude to be
     reached, see :meth:`PatternCells.amplitude` [mm]; ``largest``: nominal strain up to which to
     look for the first critical point [-]. MissingDependencyError without dolfinx.
     """
@@ -74,10 +74,10 @@ class PatternCells:
         return np.asarray(cells.reshape(self._shape), np.float64)
 
     def share(self, displacement: FloatArray) -> float:
-        """How much of a nodal field (n, 2) is the pattern, whatever its amplitude in each cell.
+        """Share of the pattern, with any amplitude in each cell, in a nodal field (n, 2) [-].
 
-        The root of the share of ∫ |u|² that lies in the span of the pattern's restrictions to
-        single cells, between 0 and 1, with the sign of the overlap with the whole pattern.
+        The root of the fraction of ∫ |u|² in the span of the pattern's restrictions to single
+        cells, with the sign of the overlap with the whole pattern; its absolute value is 0 to 1.
         """
         u = self._rule.values(displacement)
         mixed = self._products(u)
@@ -85,9 +85,9 @@ class PatternCells:
         return math.copysign(share, mixed.sum())
 
     def amplitude(self, displacement: FloatArray) -> float:
-        """The pattern's amplitude in a nodal displacement (n, 2), where it is largest [mm].
+        """The pattern's largest amplitude in a nodal displacement (n, 2) [mm].
 
-        Of 2 x 2 cells each: what has the lattice's period, or is linear, has no projection there.
+        Averaged over blocks of 2 x 2 cells: lattice-periodic and linear fields contribute nothing.
         """
         cells = self._products(self._rule.values(displacement)) / self._own
         blocks = sliding_window_view(cells, tuple(min(2, n) for n in self._shape))
@@ -96,27 +96,27 @@ class PatternCells:
 
 @dataclass(frozen=True)
 class SpecimenSpec:
-    """All that a specimen's measurement depends on."""
+    """Everything that a specimen's measurement depends on."""
 
     experiment: Experiment
-    """The compression test, its strains still to be found."""
+    """The compression test, without its strains, which are yet to be found."""
     amplitude: float
-    """Of the pattern that it is compressed to [mm]."""
+    """Amplitude of the pattern to which it is compressed [mm]."""
     largest: float
-    """Strain up to which to look for where it buckles [-]."""
+    """Strain up to which to look for its critical point [-]."""
     divisions: int
     """Elements along l of the infinite lattice's cell."""
     imaging: ImagingSpec
     correlation: SquareLatticeOptions
     given: str = ""
-    """The digest of a solution that is there already, "" to simulate."""
+    """The digest of an existing solution; "" to simulate."""
 
     @classmethod
     def of(cls, spec: ImagePairSpec, strain: float, largest: float, divisions: int) -> SpecimenSpec:
-        """Of a simulated experiment, as strongly buckled as it is at a strain [-].
+        """From a simulated experiment, with its pattern's amplitude at a strain [-].
 
-        InputError if the experiment is not perfect, did not buckle, or has a material that can't
-        be written down.
+        InputError if the experiment has an imperfection, did not buckle, or has a material that
+        can't be written to a file.
         """
         e = spec.experiment
         if not e.is_perfect or e.guided:
@@ -152,11 +152,11 @@ class SpecimenSpec:
 
     @property
     def specimen(self) -> Specimen:
-        """The geometry."""
+        """The specimen's geometry."""
         return self.experiment.specimen
 
     def changed(self, material: Material | None = None, **specimen: Any) -> SpecimenSpec:
-        """With another material, or other values of the specimen; to be simulated."""
+        """The description with another material, or other values of the specimen; to simulate."""
         experiment = replace(
             self.experiment,
             specimen=replace(self.specimen, **specimen),
@@ -165,7 +165,7 @@ class SpecimenSpec:
         return replace(self, experiment=experiment, given="")
 
     def scaled(self, pitch: float) -> SpecimenSpec:
-        """Everything in the same proportions to another l [mm], elements and pixels included."""
+        """The description scaled to another l [mm], including elements and pixels."""
         old, factor = self.specimen, pitch / self.specimen.pitch
         lengths = {n: factor * getattr(old, n) for n in ("diameter", "bulk_x", "bulk_y")}
         other = self.changed(pitch=pitch, **lengths)
@@ -179,13 +179,13 @@ class SpecimenSpec:
         )
 
     def solution_path(self, folder: Path) -> Path:
-        """Where the solution of a study's specimen is: that of all that simulating depends on."""
+        """File of the solution, named by a digest of everything the simulation depends on."""
         unseen = ("imaging", "correlation", "divisions")
         simulated = {name: value for name, value in self.plain().items() if name not in unseen}
         return folder / "solutions" / f"{digest(simulated)[:16]}.h5"
 
     def plain(self) -> dict[str, Any]:
-        """As plain JSON values."""
+        """The description as plain JSON values."""
         values: dict[str, Any] = to_plain(self)
         values["experiment"]["material"] = material_table(self.experiment.material)
         return values
@@ -199,15 +199,15 @@ class SpecimenSpec:
         return made(cls, values)
 
     def leave(self, folder: Path) -> str:
-        """Write it into the study's folder; returns the specimen's name."""
+        """Write the description into the study's folder; return the specimen's name."""
         return leave(self.plain(), folder, "specimens/{}/specimen.json")
 
 
 def lattice_mode(specimen: Specimen, material: Material, divisions: int) -> PatternMode:
-    """The mode of the infinite lattice of a specimen's cells, in uniaxial compression.
+    """The mode of the infinite lattice of a specimen's cells, under uniaxial compression.
 
-    In its first critical state, or where it stays stable in the last one looked at. Of a graded
-    specimen: the lattice of the cell at its centre. ``divisions``: elements along l.
+    It is computed at the first critical state, or at the last state if there is none. For a graded
+    specimen, the lattice has the cell at its centre. ``divisions``: elements along l.
     MissingDependencyError without dolfinx.
     """
     ratio, pitch = specimen.diameter / specimen.pitch, specimen.pitch
@@ -217,10 +217,10 @@ def lattice_mode(specimen: Specimen, material: Material, divisions: int) -> Patt
 
 
 def nearest_aspect(mode: PatternMode) -> float:
-    """a₁ of Eq. (mode) that is nearest to a lattice's mode [-].
+    """The a₁ of Eq. (mode) that is nearest to a lattice's mode [-].
 
-    By symmetry and period the mode's wave vectors and phases are the ideal ones exactly; of the
-    seven parameters a₁ is left, the ratio of the two components' amplitudes.
+    By symmetry and periodicity, the mode's wave vectors and phases are exactly the ideal ones. Of
+    the seven parameters only a₁ can differ, the ratio of the two components' amplitudes.
     """
     rule = MeshQuadrature(mode.mesh)
     shape, ideal = rule.values(mode.shape), rule.values(mode.analytic)
@@ -234,10 +234,10 @@ def nearest_aspect(mode: PatternMode) -> float:
 def overlap_on_specimen(
     mode: PatternMode, specimen: Specimen, family: ModeFamily, parameters: ArrayLike
 ) -> float:
-    """Normalised overlap of a lattice's mode with a family's over all cells of a specimen [-].
+    """Normalised overlap of a lattice's mode with a family's mode over a specimen's cells [-].
 
-    |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude; u is the mode on copies of its
-    cell about all holes, neighbours of opposite signs.
+    |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude; u is the lattice's mode on
+    copies of its cell around all holes, with opposite signs in neighbouring cells.
     """
     mesh, centres = mode.mesh, specimen.hole_centres
     steps = np.rint((centres - centres[0]) / specimen.pitch).astype(int).sum(axis=1)

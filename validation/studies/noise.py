@@ -1,21 +1,21 @@
-"""Noise study: Monte Carlo of bias, scatter against its bounds, and coverage of error bars.
+"""Noise study: Monte Carlo of bias, scatter compared with its bounds, and coverage of error bars.
 
-Why noise scatters a measurement by more than the Cramér–Rao bound, one cause after another: a
-measurement ends where the gradient of the cost vanishes. Noise perturbs that gradient, with a
-covariance V, and the unknowns follow by the inverse of the cost's Hessian H: their covariance
-is H⁻¹VH⁻¹. With noise s in both images, to first order in s:
+Noise scatters a measurement by more than the Cramér–Rao bound. The causes are added one by one. At
+the solution, the gradient of the cost vanishes. Noise perturbs this gradient, with a covariance V,
+and the unknowns change by the inverse of the cost's Hessian H: their covariance is H⁻¹VH⁻¹. With
+noise s in both images, to first order in s:
 
 ===============  ================  ==========================================================
-name             covariance / s²   what it takes into account
+name             covariance / s²   effects included
 ===============  ================  ==========================================================
-bound            2 M⁻¹             M = JᵀJ: the ansatz describes everything, and nothing shrinks
-det F            M⁻¹ V₀ M⁻¹        and where the material has shrunk, pixels share the noise of g
-curvature        H⁻¹ V₀ H⁻¹        and the model error lowers the cost's curvature
-least            H⁻¹ V H⁻¹         and the gradient of g's noise acts there, too
+bound            2 M⁻¹             M = JᵀJ: no model error, no change of area
+det F            M⁻¹ V₀ M⁻¹        also: where material has shrunk, pixels share the noise of g
+curvature        H⁻¹ V₀ H⁻¹        also: the model error lowers the cost's curvature
+least            H⁻¹ V H⁻¹         also: model error times the gradient of g's noise
 ===============  ================  ==========================================================
 
-The last is the least that least squares can do. Further up, noise is not weak any more: the
-gradient of g's own noise is no longer small against the speckle's.
+The last is the least covariance of least squares for weak noise. Strong noise is beyond first
+order: the gradient of the noise in g is no longer small compared with the speckle's.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ from modeharvest.validation.truth import rms
 from modeharvest.validation.workers import Case, Cases, Row
 
 EXAMPLES = 24
-"""Of the noise, for V; each counts as many times as there are unit cells."""
+"""Noise realisations to estimate V; each contributes one sample per unit cell."""
 _WEAK_NOISE = 0.01
-"""Noise of the examples [fraction of full scale]; only its linear effect is taken."""
+"""Noise of these realisations [fraction of full scale]; only its linear effect is used."""
 
 
 def zero_residual(images: MatchedImages) -> MatchedImages:
-    """The same without a residual: f is what g says that it is."""
+    """The same images with zero residual: f is replaced by the matched g."""
     pair = ImagePair(images.reference, images.deformed, images.result.grid)
     residual = images.result.residual(pair, images.result.order)
     f = np.where(images.used, images.reference - residual, images.reference).astype(np.float32)
@@ -72,8 +72,8 @@ def covariances_by_cause(
 ) -> dict[str, FloatArray]:
     """The (n, n) covariances of the unknowns for noise of 1 in both images, by ``COVARIANCES``.
 
-    ``result``: of a pair of exact images; ``seed``: of the examples of noise. Infinite on the
-    diagonal where the images say nothing.
+    ``result``: of a pair of exact images; ``seed``: of the noise realisations. The diagonal is
+    infinite for unknowns that the images don't determine.
     """
     matched, cell = pair.matched(result), pair.specimen.pitch
     lost = np.isinf(np.diag(result.inverse))
@@ -82,7 +82,7 @@ def covariances_by_cause(
     M = np.linalg.inv(inverse)
 
     def perturbed(images: MatchedImages) -> FloatArray:
-        """The gradient's covariance: s²M by noise in f, and what examples of that in g do."""
+        """The gradient's covariance: M by noise in f, plus that of realisations of noise in g."""
         examples = _noise_of_g(images.reference, seed)
         by_g = images.noise_covariance(examples, cell, images.result.inverse) / _WEAK_NOISE**2
         return np.asarray(M + M @ by_g[at] @ M)
@@ -103,7 +103,7 @@ def covariances_by_cause(
 
 
 def _noise_of_g(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, FloatImage]]:
-    """Examples of noise in g alone."""
+    """Realisations of noise in g alone, as pairs (noise of f, noise of g)."""
     rng = np.random.default_rng([seed, EXAMPLES])
     none = np.zeros_like(like)
     for _ in range(EXAMPLES):
@@ -113,9 +113,9 @@ def _noise_of_g(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, Float
 
 @dataclass(frozen=True)
 class NoiseStudy(Study[NoiseAnalysis]):
-    """Correlate a pair of images under white noise in both, many times.
+    """Correlate a pair of images many times, each time with new white noise in both.
 
-    InputError if a value is out of its range, or a level comes twice.
+    InputError if a value is out of range, or a level occurs twice.
     """
 
     question: ClassVar[str] = (
@@ -130,9 +130,9 @@ class NoiseStudy(Study[NoiseAnalysis]):
     levels: tuple[float, ...] = (0.002, 0.005, 0.01, 0.02)
     """Standard deviations of the noise [fraction of full scale]; 0.01 is 2.6 of 255 levels."""
     pairs: int = 25
-    """Of realisations n and -n at each level."""
+    """Number of pairs of realisations n and -n at each level."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
 
     def __post_init__(self) -> None:
         if not self.levels or not all(0.0 < level < 1.0 for level in self.levels):
@@ -144,7 +144,7 @@ class NoiseStudy(Study[NoiseAnalysis]):
         self.require_different("levels", self.levels)
 
     def require(self, correlation: SquareLatticeOptions) -> None:
-        """Noise is added to exact images, not to rounded ones."""
+        """Require exact images: noise is not added to rounded ones."""
         if correlation.camera:
             raise InputError(
                 "study: expected correlation.camera = false, got true: the noise study adds its "
@@ -156,26 +156,26 @@ class NoiseStudy(Study[NoiseAnalysis]):
         return replace(self, pairs=max(2, -(-self.pairs // 5)))
 
     def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
-        """Make the images; the cases are level, number and sign of the noise, the first without."""
+        """Make the images; cases vary level, number, sign of the noise; the first has no noise."""
         name = spec.describe(folder, self.strain)
         VirtualImagePair.open(folder, name, progress)
         base = {"images": name, "level": 0.0, "pair": 0, "sign": 1, "seed": self.seed}
         return base, *grid(base, level=self.levels, pair=range(self.pairs), sign=(1, -1))
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> NoiseAnalysis:
-        """Errors against their bounds; InputError without two whole pairs or a noise-free case."""
+        """Errors and bounds; InputError without two complete pairs or the noise-free case."""
         return NoiseAnalysis.of(table, VirtualImagePair.open(folder, table["images"].iloc[0]))
 
 
 def one_realisation(case: Case, folder: Path) -> Row:
-    """Correlate under one realisation of the noise, from the standard initial guess.
+    """Correlate with one realisation of the noise, from the standard initial guess.
 
-    ``predicted``: standard deviations of the unknowns by the result's own covariance given the
-    noise, followed by those of the fields at :class:`FieldPoints`; without noise a list of them for
-    each of ``COVARIANCES``, for noise of 1, and errors as in
+    ``predicted``: standard deviations of the unknowns by the result's covariance for this noise,
+    followed by those of the fields at :class:`FieldPoints`. Without noise, it is a list of them for
+    each of ``COVARIANCES``, for noise of 1, and the row has errors as in
     :meth:`~modeharvest.validation.studies.study.VirtualImagePair.errors`. ``curvature_sd_mm``: rms
-    over the points of u's standard deviation by the covariance H⁻¹, without noise and in the first
-    realisation of each level [mm].
+    over the points of u's standard deviation by the covariance H⁻¹ [mm], for the case without noise
+    and the first realisation of each level.
     """
     virtual, level = VirtualImagePair.open(folder, case["images"]), float(case["level"])
     points, pair = FieldPoints.of(virtual), virtual.pair

@@ -1,7 +1,7 @@
 """Statistics of a noise study: fields at points, paired realisations, bounds, coverage.
 
 Realisations come in pairs, n and -n. The mean of a pair's two errors is of second order in the
-noise, so that a bias shows long before it would out of the scatter.
+noise, so that a bias is detected even if it is much smaller than the scatter.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from modeharvest.util.errors import InputError
 from modeharvest.validation.studies.study import VirtualImagePair
 
 PARTS = {"u": slice(0, 2), "v0": slice(2, 4), "v1": slice(4, 5), "v1 phi1": slice(5, 7)}
-"""The fields by their names, and which of the seven components are theirs."""
+"""Names of the fields, and their components among the seven."""
 PER_CELL = 3
-"""Points along the edge of a unit cell: the errors are as smooth as the ansatz."""
+"""Points along the edge of a unit cell; enough, as the errors are as smooth as the ansatz."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldPoints:
-    """Where fields are compared."""
+    """Points of an image pair at which fields are compared."""
 
     pair: VirtualImagePair
     rows: NDArray[np.intp]
     cols: NDArray[np.intp]
-    """Axes of the coarse grid, in pixels of the images."""
+    """Pixel rows and columns of the coarse grid."""
     inside: BoolArray
-    """(rows, cols) True on material; the points are those, row by row."""
+    """(rows, cols) True on material, in the coarse grid; these are the points, row by row."""
     x: FloatArray
     y: FloatArray
-    """(points,) [mm]."""
+    """(points,) positions [mm]."""
 
     @classmethod
     def of(cls, pair: VirtualImagePair) -> FieldPoints:
-        """The points of a pair, the same in every worker."""
+        """The points of a pair; the same in every worker."""
         grid = pair.images.grid
         step = max(1, round(pair.specimen.pitch / PER_CELL / grid.pixel_size))
         rows, cols = (np.arange((n % step) // 2, n, step) for n in grid.shape)
@@ -51,7 +51,7 @@ class FieldPoints:
 
     @property
     def cellular(self) -> BoolArray:
-        """(points,) True in the part with holes: elsewhere v1 says little or nothing."""
+        """(points,) True in the cellular part; elsewhere v1 has little or no effect."""
         a, b = self.pair.specimen.cellular_half_size
         return np.asarray((np.abs(self.x) <= a) & (np.abs(self.y) <= b))
 
@@ -69,16 +69,16 @@ class FieldPoints:
         return np.asarray(np.concatenate(parts, axis=-1)[:, 0])
 
     def map(self, values: FloatArray) -> FloatArray:
-        """(rows, cols) of values at the points; NaN where there is no material."""
+        """(rows, cols) map of values (points,) on the coarse grid; NaN without material."""
         drawn = np.full(self.inside.shape, np.nan)
         drawn[self.inside] = values
         return drawn
 
 
 CAUSES = ("bound", "det F", "curvature", "least")
-"""Each with all that stand before it."""
+"""Names of covariances; each includes the effects of all before it, see ``noise``."""
 HESSIAN_CORRECTED = "hessian"
-"""2 H⁻¹MH⁻¹: :func:`~modeharvest.idic.uncertainty.covariance.covariance`."""
+"""Name of 2 H⁻¹MH⁻¹, see :func:`~modeharvest.idic.uncertainty.covariance.covariance`."""
 COVARIANCES = (*CAUSES, HESSIAN_CORRECTED)
 _NORMAL_95 = 1.959964
 """Half the width of a 95 % interval [standard deviations]."""
@@ -97,54 +97,54 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class PairedErrors:
-    """Errors under noise."""
+    """Errors of several quantities under pairs of noise realisations."""
 
     errors: FloatArray
     predicted: FloatArray
-    """(pairs, 2, ...) of the realisations n and -n, in any unit, and the standard deviations that
-    each result predicts."""
+    """(pairs, 2, ...) errors for the realisations n and -n, in any unit, and the standard
+    deviations that each result predicts."""
     bound: FloatArray
-    """(...) the least there can be, 0 for what no noise moves (a mode outside its support), which
-    does not count."""
+    """(...) lower bound of the standard deviation; quantities unaffected by noise (a mode outside
+    its support) have 0 and are ignored in the statistics."""
 
     @property
     def counted(self) -> BoolArray:
-        """(...): True where there is something to be off."""
+        """(...) True for quantities affected by noise."""
         return np.asarray(self.bound > 0.0)
 
     @property
     def standardised(self) -> PairedErrors:
-        """What counts in units of the bound, flat: everything weighs alike."""
+        """The counted quantities divided by their bounds, flat, so that all have equal weight."""
         kept = self.of(self.counted)
         scaled = kept.errors / kept.bound, kept.predicted / kept.bound
         return PairedErrors(*scaled, np.ones_like(kept.bound))
 
     def of(self, part: BoolArray) -> PairedErrors:
-        """Some of the quantities: those where ``part``, of the bound's shape, is True."""
+        """The quantities for which ``part``, of the bound's shape, is True."""
         return PairedErrors(self.errors[:, :, part], self.predicted[:, :, part], self.bound[part])
 
     def against(self, factor: FloatArray) -> PairedErrors:
-        """The same errors, bound and error bars ``factor`` (...) as large."""
+        """The same errors, with bounds and predicted values multiplied by ``factor`` (...)."""
         return PairedErrors(self.errors, factor * self.predicted, factor * self.bound)
 
     @property
     def ratios(self) -> FloatArray:
-        """(...): rms error over bound, each by itself [-]; NaN for what does not count."""
+        """(...) rms error over bound of each quantity [-]; NaN for ignored quantities."""
         return self._over_bound(np.sqrt((self.errors**2).mean(axis=(0, 1))))
 
     @property
     def biases(self) -> FloatArray:
-        """(...): mean error over bound, likewise [-]."""
+        """(...) mean error over bound of each quantity [-]; NaN for ignored quantities."""
         return self._over_bound(self.errors.mean(axis=(0, 1)))
 
     @property
     def covered(self) -> FloatArray:
-        """(...): share of the 95 % intervals that contain the truth, likewise [-]."""
+        """(...) share of 95 % intervals that contain the truth [-]; NaN for ignored quantities."""
         return np.asarray(np.where(self.counted, self._inside.mean(axis=(0, 1)), np.nan))
 
     @property
     def rms_bound(self) -> float:
-        """Rms of the bound; as all that follows, of what counts."""
+        """Rms of the bound over the counted quantities, as in all the following numbers."""
         return float(np.sqrt((self.bound[self.counted] ** 2).mean()))
 
     @property
@@ -157,7 +157,7 @@ class PairedErrors:
 
     @property
     def bias(self) -> Estimate:
-        """Rms of the mean error, freed from the remaining scatter, over rms bound [-]."""
+        """Rms of the mean error, corrected for its scatter, over rms bound [-]."""
         even, count = self.of(self.counted).errors.mean(axis=1), len(self.errors)
         mean_square = float((even.mean(axis=0) ** 2).mean())
         scatter = float((even.var(axis=0, ddof=1) / count).mean())
@@ -179,16 +179,16 @@ class PairedErrors:
 
 
 def _divided(a: FloatArray, by: FloatArray, where: BoolArray, otherwise: float) -> FloatArray:
-    """(...) quotients where it is said, and elsewhere a number."""
+    """(...) a / by where ``where`` is True, elsewhere ``otherwise``."""
     return np.asarray(np.divide(a, by, out=np.full(a.shape, otherwise), where=where))
 
 
 Levels = Mapping[float, Mapping[str, PairedErrors]]
-"""For each level of noise, in order, the errors of the "unknowns" and of the fields."""
+"""For each noise level, in order, the errors of the "unknowns" and of the fields."""
 
 
 def by_field(unknowns: FloatArray, fields: FloatArray) -> dict[str, FloatArray]:
-    """Standard deviations, or errors, by what they are of.
+    """Standard deviations, or errors, by name: "unknowns" and the fields.
 
     ``unknowns``: (..., n), each in its own unit; ``fields``: (..., points, 7) [mm], see ``PARTS``.
     """
@@ -196,7 +196,7 @@ def by_field(unknowns: FloatArray, fields: FloatArray) -> dict[str, FloatArray]:
 
 
 def _predictions(flat: FloatArray, n: int) -> dict[str, FloatArray]:
-    """Of n unknowns and of the fields, from (..., n + 7 points) as the cases store it."""
+    """Standard deviations by name, from the cases' flat form (..., n + 7 points)."""
     fields = flat[..., n:]
     return by_field(flat[..., :n], fields.reshape(*fields.shape[:-1], -1, 7))
 
@@ -204,10 +204,10 @@ def _predictions(flat: FloatArray, n: int) -> dict[str, FloatArray]:
 def _read_level(
     part: pd.DataFrame, true: FloatArray, bound: Mapping[str, FloatArray], points: FieldPoints
 ) -> dict[str, PairedErrors]:
-    """Errors of a level's whole pairs of realisations.
+    """Errors of a level's complete pairs of realisations.
 
-    ``true``: (n,) unknowns without noise; ``bound``: standard deviations, 0 or infinite for what
-    does not count: no noise moves it, or the images do not determine it.
+    ``true``: (n,) unknowns without noise; ``bound``: standard deviations; 0 or infinite for ignored
+    quantities, which noise does not affect or the images do not determine.
     """
     by_pair = [pair.sort_values("sign") for _, pair in part.groupby("pair") if len(pair) == 2]
 
@@ -228,7 +228,7 @@ def _read_level(
 def _against(
     levels: Levels, bound: Mapping[str, FloatArray], sd: Mapping[str, FloatArray]
 ) -> Levels:
-    """Set errors against other standard deviations than the bound's."""
+    """Compare the errors with other standard deviations than the bound's."""
     factors = {
         name: _divided(sd[name], part, np.isfinite(part) & (part > 0.0), 1.0)
         for name, part in bound.items()
@@ -241,24 +241,24 @@ def _against(
 
 @dataclass(frozen=True, eq=False)
 class NoiseAnalysis:
-    """What the table of a noise study says."""
+    """Evaluation of the table of a noise study."""
 
     points: FieldPoints
     noise_free: pd.Series
-    """The row of the case without noise, whose unknowns all errors are measured from."""
+    """The row of the case without noise; all errors are relative to its unknowns."""
     predicted: Mapping[str, Mapping[str, FloatArray]]
     """Standard deviations for noise of 1 by each of ``COVARIANCES``, see :func:`by_field`."""
     against: Mapping[str, Levels]
-    """The errors against each of them, and error bars by it."""
+    """The errors compared with each of them, and the corresponding error bars."""
     curvature_sd_ratio: Mapping[float, float]
-    """By level, u's standard deviation by noisy images' own curvature over that of exact ones."""
+    """By level, u's standard deviation by the curvature of noisy images over that of exact ones."""
     not_converged: int
 
     @classmethod
     def of(cls, table: pd.DataFrame, pair: VirtualImagePair) -> NoiseAnalysis:
         """From the table of all realisations of a pair.
 
-        InputError if the case without noise failed, or no level has two whole pairs.
+        InputError if the case without noise failed, or no level has two complete pairs.
         """
         points, done = FieldPoints.of(pair), table[table["error"] == ""]
         noise_free = done[done["level"] == 0.0]
@@ -271,7 +271,7 @@ class NoiseAnalysis:
             for cause, flat in zip(COVARIANCES, row["predicted"], strict=True)
         }
         least = dict(predicted["bound"])
-        least["v1"] = np.where(points.cellular[:, None], least["v1"], 0.0)  # where phi1 fades out
+        least["v1"] = np.where(points.cellular[:, None], least["v1"], 0.0)  # phi1 tapers off there
         levels = {
             float(level): _read_level(part, true, {k: level * v for k, v in least.items()}, points)
             for level, part in done[done["level"] > 0.0].groupby("level")

@@ -38,27 +38,27 @@ MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 fix
 
 @lru_cache(maxsize=2)
 def _exact_pair(spec: ResolutionSpec, motion: str) -> ImagePair:
-    """The images without wave and noise."""
+    """The images without wave and without noise."""
     return spec.buckled.still() if motion == "still" else spec.buckled.images()
 
 
 @lru_cache(maxsize=32)
 def _noise_free(spec: ResolutionSpec, motion: str, degree: int) -> Result:
-    """What is measured in them."""
+    """The result of correlating them."""
     return spec.correlate(_exact_pair(spec, motion), degree, motion)
 
 
 def one_case(case: Case, folder: Path) -> Row:
-    """Run a case of :meth:`ResolutionStudy.prepare`; its ``task`` says what: wave, noise, floor.
+    """Run a case of :meth:`ResolutionStudy.prepare`; its ``task`` is wave, noise or floor.
 
-    Quantities of several degrees have the degree behind an underscore.
+    Names of quantities that depend on the degree end with an underscore and the degree.
     """
     tasks = {"wave": _wave, "noise": _noise, "floor": _floor}
     return tasks[case["task"]](case, ResolutionSpec.read(folder, case["images"]))
 
 
 def _wave(case: Case, spec: ResolutionSpec) -> Row:
-    """The shares of a wave that are found in its own part and in the whole, by degree."""
+    """The shares of a wave measured in its own part and in the whole displacement, by degree."""
     buckled, points = spec.buckled, spec.points
     amplitude = spec.amplitude_px * buckled.pixel_size
     wave = AddedWave(case["part"], case["axis"], case["period"], case["phase"], amplitude)
@@ -76,7 +76,7 @@ def _wave(case: Case, spec: ResolutionSpec) -> Row:
 
 
 def _changes(quiet: Result, found: Result, points: FloatArray) -> list[FloatArray]:
-    """By how much v0 (m, 2), v1 (m,) and v1 phi1 (m, 2) of two results differ at points [mm]."""
+    """Differences of v0 (m, 2), v1 (m,) and v1 phi1 (m, 2) of two results at points [mm]."""
     x, y = points[:, 0, None], points[:, 1, None]
     before, after = (
         (ansatz.v0(a, x, y), ansatz.v(0, a, x, y), ansatz.fluctuation(0, a, x, y))
@@ -86,14 +86,14 @@ def _changes(quiet: Result, found: Result, points: FloatArray) -> list[FloatArra
 
 
 def _floor(case: Case, spec: ResolutionSpec) -> Row:
-    """Standard deviations by 2 s^2 M^-1 of the exact images, rms over the material [px]."""
+    """Noise floors of the fields: sd by 2 s^2 M^-1 of the exact images, rms over material [px]."""
     result = _noise_free(spec, case["motion"], case["degree"])
     predicted = _predicted(spec, result, 2.0 * spec.noise**2 * result.inverse)
     return {"unknowns": result.ansatz.size, "outcome": result.outcome.value, **predicted}
 
 
 def _noise(case: Case, spec: ResolutionSpec) -> Row:
-    """Errors of fields from noisy images, and those their covariance predicts, by degree [px]."""
+    """Errors of fields in noisy images, and errors predicted by covariances, by degree [px]."""
     motion = case["motion"]
     rng = np.random.default_rng([case["seed"], case["number"], motion == "still"])
     pair = noisy(_exact_pair(spec, motion), spec.noise, rng)
@@ -119,7 +119,7 @@ def _predicted(spec: ResolutionSpec, result: Result, covariance: FloatArray) -> 
 def _rms_px(
     spec: ResolutionSpec, v0: FloatArray, v1: FloatArray, v1phi1: FloatArray, u: FloatArray
 ) -> Row:
-    """Rms [px] of fields [mm] at ``spec.sparse``, v1's as the largest v1 phi1 that it makes."""
+    """Rms [px] of fields [mm] at ``spec.sparse``; v1 is scaled by the largest ||phi1||."""
     _, cellular = spec.sparse
     mm = {"v0": rms(v0), "v1": LARGEST * rms(v1[cellular]), "v1phi1": rms(v1phi1[cellular]),
           "u": rms(u)}  # fmt: skip
@@ -128,14 +128,14 @@ def _rms_px(
 
 @dataclass(frozen=True, eq=False)
 class ResolutionAnalysis:
-    """What the table of a resolution study says."""
+    """Evaluation of the table of a resolution study."""
 
     spec: ResolutionSpec
     rows: pd.DataFrame
-    """The table of what succeeded."""
+    """The cases that succeeded."""
     degrees: list[DegreeResolution]
     chosen: DegreeResolution
-    """Of all degrees the one nearest to the specification's own v0 degree."""
+    """The degree nearest to the v0 degree of the specification."""
     curves: TransferCurves
     passband: Passband
     """Best fits of waves, and of patterns of other wavelengths."""
@@ -154,7 +154,7 @@ class ResolutionAnalysis:
 
 @dataclass(frozen=True)
 class ResolutionStudy(Study[ResolutionAnalysis]):
-    """Small waves of v0 and v1 on a buckled specimen, and noise, against the polynomial degree.
+    """Measure small waves of v0 and v1 on a buckled specimen, and noise, by polynomial degree.
 
     InputError for values out of range.
     """
@@ -171,17 +171,17 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
     strain: float = 0.128
     """Nominal compression of the base motion [-]."""
     pattern: float = 7.0
-    """Its v1, the same everywhere [mm]."""
+    """Uniform v1 of the base motion [mm]."""
     degrees: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
-    """Of v0 and v1 alike."""
+    """Degrees of v0 and of v1, the same for both."""
     measured: tuple[int, ...] = (3, 5, 7)
-    """Those of them that images are measured with, too."""
+    """Those degrees with which images are also measured."""
     amplitude_px: float = 0.5
-    """Of a wave [px]."""
+    """Amplitude of a wave [px]."""
     noise: float = 0.01
-    """Standard deviation in each image [fraction of full scale]."""
+    """Standard deviation of the noise in each image [fraction of full scale]."""
     realisations: int = 20
-    """Of the noise, from ``seed``."""
+    """Number of realisations of the noise, from ``seed``."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -203,7 +203,7 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
             )
 
     def require(self, correlation: SquareLatticeOptions) -> None:
-        """The mode is measured, in exact images, and brightness is none of the question."""
+        """Require a free mode, exact images, and no unknown gain or offset."""
         super().require(correlation)
         if correlation.camera or correlation.brightness.size:
             raise InputError(
@@ -217,7 +217,7 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
         return replace(self, measured=(middle,), realisations=max(2, self.realisations // 2))
 
     def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
-        """Say what is measured; the cases are waves, noise, and the floors of exact images."""
+        """Write the specification; the cases are waves, noise, and noise floors of exact images."""
         specimen, how, imaging = spec.experiment.specimen, spec.correlation, spec.imaging
         buckled = BuckledMotion(
             specimen, how, imaging.speckle, imaging.pixel_size, self.strain, self.pattern

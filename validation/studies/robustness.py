@@ -19,14 +19,14 @@ from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualIm
 from modeharvest.validation.workers import Case, Cases, Row
 
 SAME_PX = 0.01
-"""Solutions nearer than this, rms, are the same minimum [px]."""
+"""Solutions whose displacements differ by less, rms, are the same minimum [px]."""
 OUTLIER_PERCENT = 1.5
-"""Above this epsilon the paper calls a result erroneous."""
+"""Epsilon above which the paper calls a result erroneous [%]."""
 PUBLISHED = {"success": 0.98, "mean_epsilon_percent": 0.86,
              "mean_epsilon_without_outliers_percent": 0.45}  # fmt: skip
 """Section "Virtual Experiments" of the paper: 100 initial guesses, parameters up to 10 % off."""
 EVERY = 4
-"""Displacements are compared at every fourth pixel: they are smooth."""
+"""Displacements are compared at every fourth pixel, since they are smooth."""
 
 
 def success_interval(good: int, count: int) -> tuple[float, float]:
@@ -37,10 +37,10 @@ def success_interval(good: int, count: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class GuessStatistics:
-    """The paper's numbers and more, of the initial guesses within one radius.
+    """The paper's statistics, and others, for the initial guesses within one radius.
 
-    Distances are the rms length of the difference of two displacements, from the reference
-    solution's.
+    Distances are rms lengths of the difference between a displacement and that of the reference
+    solution.
     """
 
     initial_guesses: int
@@ -61,7 +61,7 @@ class GuessStatistics:
 
     @classmethod
     def of(cls, guesses: pd.DataFrame, radius: float) -> GuessStatistics:
-        """From the rows of those guesses, with a column ``same``."""
+        """From the rows of these guesses, which have a column ``same``."""
         same = guesses["same"]
         good, count = int(same.sum()), len(guesses)
         epsilon = guesses["epsilon_percent"].dropna()
@@ -80,25 +80,25 @@ class GuessStatistics:
 
 @dataclass(frozen=True, eq=False)
 class RobustnessAnalysis:
-    """What the table of a robustness study says.
+    """Evaluation of the table of a robustness study.
 
-    In its rows ``same`` is whether each is the reference solution's minimum.
+    In its rows, ``same`` is True if the result is the reference solution's minimum.
     """
 
     moved: pd.DataFrame
     at_radius: pd.DataFrame
-    """Rows with perturbed mode parameters, all and of the paper's radius."""
+    """Rows with perturbed mode parameters: all, and those of the study's ``radius``."""
     strains: pd.DataFrame
-    """Rows with a wrong strain."""
+    """Rows with a wrong initial strain."""
     statistics: GuessStatistics
-    """Of the paper's radius."""
+    """Statistics for the study's ``radius``."""
 
 
 @dataclass(frozen=True)
 class RobustnessStudy(Study[RobustnessAnalysis]):
     """Correlate from many initial guesses.
 
-    InputError if a value is out of its range, or one comes twice.
+    InputError if a value is out of range, or occurs twice.
     """
 
     question: ClassVar[str] = (
@@ -112,16 +112,16 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
 
     strain: float = 0.128
     initial_guesses: int = 100
-    """With mode parameters perturbed by up to ``radius``; 100 in the paper."""
+    """Number of guesses with mode parameters perturbed by up to ``radius``; 100 in the paper."""
     radius: float = 0.1
-    """A share of 1 for a1 ... a5, of the unit cell for the two phases [-]; 0.1 in the paper."""
+    """Largest perturbation [-]: of a1 ... a5; of the two phases over l; 0.1 in the paper."""
     radii: tuple[float, ...] = (0.05, 0.15, 0.2, 0.3, 0.4, 0.5)
     per_radius: int = 20
-    """Further radii, for the basin, and how many guesses of each."""
+    """Further radii, for the basin of convergence, and the number of guesses for each."""
     strain_errors: tuple[float, ...] = (-1.0, -0.5, -0.2, 0.2, 0.5)
-    """Further guesses: their v0 has the applied strain times 1 plus these, the mode as it is."""
+    """Further guesses: v0 with the applied strain times (1 + these), the mode not perturbed."""
     seed: int = 0
-    """Of the perturbations."""
+    """Seed of the perturbations."""
 
     def __post_init__(self) -> None:
         counts_fit = 1 <= self.initial_guesses <= self.most and 0 <= self.per_radius <= self.most
@@ -146,7 +146,7 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         )
 
     def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
-        """Make the images; the cases are radius, number of the guess and seed."""
+        """Make the images; a case has a radius or a strain error, a number and a seed."""
         name = spec.describe(folder, self.strain)
         VirtualImagePair.open(folder, name, progress)
         base = {"images": name, "radius": self.radius, "start": 0, "strain_error": 0.0,
@@ -158,7 +158,7 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         return tuple(cases)
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> RobustnessAnalysis:
-        """Success, epsilon and distances; what failed counts as not arrived."""
+        """Success, epsilon and distances; failed cases count as not converged."""
         table = table.assign(same=table["distance_px"] < SAME_PX)
         moved = table[table["strain_error"] == 0.0]
         at_radius = moved[moved["radius"] == self.radius]
@@ -170,9 +170,9 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
 def one_start(case: Case, folder: Path) -> Row:
     """Correlate from one perturbed initial guess, and compare with the reference solution.
 
-    ``distance_px``, ``start_distance_px``: rms length of the difference of the solution's, or the
-    guess', displacement from the reference solution's [px]; ``epsilon_percent``: the paper's, the
-    difference of their norms.
+    ``distance_px``, ``start_distance_px``: rms length of the difference between the displacement of
+    the solution, or of the guess, and the reference solution's [px]; ``epsilon_percent``: the
+    paper's measure, the relative difference of their norms [%].
     """
     pair = VirtualImagePair.open(folder, case["images"])
     reference = _reference_solution(folder, case["images"])
@@ -189,7 +189,7 @@ def one_start(case: Case, folder: Path) -> Row:
 
 
 def _perturbed_guess(pair: VirtualImagePair, case: Case) -> FloatArray:
-    """(n,) of a case; the same directions for every radius."""
+    """(n,) initial guess of a case; the directions are the same for every radius."""
     ansatz, strain = pair.ansatz, pair.strain * (1.0 + case["strain_error"])
     guess = ansatz.initial_guess(strain, pair.options.start_amplitude)
     unit = np.random.default_rng([case["seed"], case["start"]]).uniform(-1.0, 1.0, 7)
@@ -199,19 +199,19 @@ def _perturbed_guess(pair: VirtualImagePair, case: Case) -> FloatArray:
 
 
 def _field(pair: VirtualImagePair, unknowns: FloatArray) -> FloatArray:
-    """(points, 2) displacement at some pixels of the material [px]."""
+    """(points, 2) displacement at every EVERY-th pixel of the material [px]."""
     grid, mask = pair.images.grid, pair.mask
     u = pair.ansatz.displacement(unknowns, grid.x[::EVERY], grid.y[::EVERY])
     return np.asarray(u[mask[::EVERY, ::EVERY]] / grid.pixel_size)
 
 
 def _rms(field: FloatArray) -> float:
-    """Rms length of (points, 2) vectors."""
+    """Rms length of vectors (points, 2)."""
     return float(np.sqrt((field**2).sum(axis=-1).mean()))
 
 
 @lru_cache(maxsize=1)
 def _reference_solution(folder: Path, name: str) -> FloatArray:
-    """(points, 2) displacement from the standard initial guess [px]; once in each worker."""
+    """(points, 2) displacement of the correlation from the standard guess [px]; cached."""
     pair = VirtualImagePair.open(folder, name)
     return _field(pair, pair.correlate().unknowns)

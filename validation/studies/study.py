@@ -1,10 +1,10 @@
-"""What all studies share: the frame of a study, and pairs of virtual images that workers open.
+"""Base of all studies: the class of a study, and pairs of virtual images that workers open.
 
 A pair is described once, made once, and opened by workers. In a study's folder::
 
     solution.h5            the exact displacements
-    pairs/NAME.json        a pair, how it is imaged and how it is correlated; NAME is its digest
-    images/KEY/            the images, under the digest of all that they depend on
+    pairs/NAME.json        a pair, its imaging and its correlation; NAME is its digest
+    images/KEY/            the images; KEY is the digest of everything they depend on
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class StudySetting:
     imaging: ImagingSpec
     correlation: SquareLatticeOptions
     taper: float = 0.5
-    """Width over which the mode fades out beside the cellular part [unit cells]; InputError if it
-    has none."""
+    """Width over which the mode tapers off outside the cellular part [unit cells]; InputError if it
+    is not positive."""
 
     def __post_init__(self) -> None:
         if not self.taper > 0.0:
@@ -63,8 +63,8 @@ class ImagePairSpec:
     imaging: ImagingSpec
     correlation: SquareLatticeOptions
     load: Callable[[], Solution]
-    """Gives the exact displacements; called when they are first needed, because simulating them
-    takes long and not every study asks for them."""
+    """Returns the exact displacements; called when they are first needed, because the simulation
+    takes long and not every study needs them."""
 
     def __post_init__(self) -> None:
         if (specimen := self.experiment.specimen).is_staggered:
@@ -80,14 +80,14 @@ class ImagePairSpec:
 
     @property
     def setting(self) -> StudySetting:
-        """How it is imaged and correlated unless a study says otherwise."""
+        """Imaging and correlation, unless a study says otherwise."""
         return StudySetting(self.imaging, self.correlation)
 
     def describe(self, folder: Path, strain: float, setting: StudySetting | None = None) -> str:
-        """Leave in a study's folder what a worker needs to open a pair; returns the pair's name.
+        """Write to a study's folder what a worker needs to open a pair; return the pair's name.
 
-        ``strain``: of the deformed image [-], an InputError if the solution has no snapshot there;
-        ``setting``: instead of the specification's own.
+        ``strain``: of the deformed image [-], InputError if the solution has no snapshot there;
+        ``setting``: replaces the specification's own.
         """
         have = sorted({s.nominal_strain for s in self.solution.snapshots})
         if not any(abs(strain - e) < 1e-9 for e in have):
@@ -108,20 +108,20 @@ class ImagePairSpec:
 
 @dataclass(frozen=True, eq=False)
 class VirtualImagePair:
-    """A pair of images and how to correlate it."""
+    """A pair of virtual images with the options of its correlation."""
 
     images: ImageSet
     strain: float
-    """Of the deformed image [-]."""
+    """Nominal strain of the deformed image [-]."""
     specimen: Specimen
     setting: StudySetting
 
     @classmethod
     def open(cls, folder: Path, name: str, progress: Progress = silent) -> VirtualImagePair:
-        """The pair that :meth:`ImagePairSpec.describe` described; its images are made if need be.
+        """Open a pair written by :meth:`ImagePairSpec.describe`; its images are made if missing.
 
-        To be opened once before workers do. InputError if there is no such pair, or the folder's
-        solution is not the one it is of.
+        Open it once before the workers do. InputError if there is no such pair, or the folder has
+        another solution than the pair's.
         """
         described = _description(folder, name)
         strain, specimen = float(described["strain"]), made(Specimen, described["specimen"])
@@ -143,21 +143,21 @@ class VirtualImagePair:
 
     @staticmethod
     def images_folder(folder: Path, name: str) -> Path:
-        """Where the images of a pair are, or will be; pairs may share theirs."""
+        """Folder of the images of a pair; several pairs may share it."""
         return folder / "images" / str(_description(folder, name)["images"])
 
     def discard(self) -> None:
-        """Remove the images from the disk: there are many where a study varies them."""
+        """Remove the images from the disk, as a study that varies them makes many."""
         shutil.rmtree(self.images.folder, ignore_errors=True)
 
     @property
     def options(self) -> SquareLatticeOptions:
-        """Of the correlation."""
+        """Options of the correlation."""
         return self.setting.correlation
 
     @property
     def ansatz(self) -> Ansatz:
-        """The paper's, on this specimen."""
+        """The paper's ansatz for this specimen."""
         usual = self.options.ansatz(self.specimen)
         (mode,) = usual.modes
         taper = replace(mode.taper, width=self.setting.taper * self.specimen.pitch)
@@ -169,40 +169,40 @@ class VirtualImagePair:
 
     @property
     def pair(self) -> ImagePair:
-        """The images as the options want them: exact, or a camera's; kept for the next case."""
+        """The images, exact or a camera's according to the options; cached for the next case."""
         return _read_pair(self.images.folder, self.strain, self.options.camera)
 
     @property
     def mask(self) -> BoolArray:
-        """(rows, cols) True on material of the reference."""
+        """(rows, cols) True on material in the reference image."""
         return self.pair.masks[0]
 
     def correlate(self, start: FloatArray | None = None, pair: ImagePair | None = None) -> Result:
-        """Correlate the pair, or a noisy one, from the standard initial guess or another."""
+        """Correlate this pair or a noisy one, from the standard initial guess or ``start`` (n,)."""
         guess = self.initial_guess() if start is None else start
         options = self.options.options()
         return correlate(pair or self.pair, self.ansatz, guess=guess, options=options)
 
     def matched(self, result: Result, pair: ImagePair | None = None) -> MatchedImages:
-        """What a correlation of the pair, or of a noisy one, compared at its solution."""
+        """The images of this pair, or of a noisy one, matched by a result."""
         return MatchedImages.of(result, pair or self.pair, self.options.edge_px)
 
     def compare(self, result: Result) -> Comparison:
-        """Set a result against the truth and the best fit of its ansatz."""
+        """Compare a result with the truth and with the best fit of its ansatz."""
         guess, camera = self.initial_guess(), self.options.camera
         return compare(self.images, self.strain, result, guess, camera)
 
     def errors(self, result: Result) -> Row:
         """Errors of a result against the truth, for a row of a study's table.
 
-        By :meth:`~modeharvest.validation.truth.Comparison.error_parts` and ``v1_percent`` of it.
+        See ``error_parts`` and ``v1_percent`` of :class:`~modeharvest.validation.truth.Comparison`.
         """
         found = self.compare(result)
         return {**found.error_parts(), "v1_percent": found.v1_percent(self.specimen)}
 
 
 def outcome_of(result: Result) -> Row:
-    """How a correlation ended, for a row of a study's table."""
+    """Outcome of a correlation, for a row of a study's table."""
     return {
         "outcome": result.outcome.value,
         "iterations": result.iterations,
@@ -211,7 +211,7 @@ def outcome_of(result: Result) -> Row:
 
 
 def noisy(pair: ImagePair, level: float, rng: np.random.Generator, sign: float = 1.0) -> ImagePair:
-    """The pair with white noise of that standard deviation, or its negative, in both images."""
+    """The pair with white noise of standard deviation ``level``, times ``sign``, in both images."""
     n = rng.normal(scale=level, size=(2, *pair.reference.shape)).astype(np.float32)
     n *= np.float32(sign)
     return pair.with_images(pair.reference + n[0], pair.deformed + n[1])
@@ -227,29 +227,29 @@ def _read_pair(folder: Path, strain: float, camera: bool) -> ImagePair:
 
 
 A = TypeVar("A")
-"""What a study's table says, as a dataclass."""
+"""Type of a study's evaluation, a dataclass."""
 
 
 class Study(ABC, Generic[A]):
-    """A question, as options in a frozen dataclass; see docs/how-to/studies.md for one's own."""
+    """A study, with its options in a frozen dataclass; new studies: docs/how-to/studies.md."""
 
     question: ClassVar[str]
-    """What is asked, for the report."""
+    """The study's question, for the report."""
     function: ClassVar[str]
-    """The "package.module:name" of what runs one case."""
+    """The "package.module:name" of the function that runs one case."""
     most: ClassVar[int] = 100_000
-    """Of what is repeated in a study; each is a case and its file."""
+    """Largest number of repetitions in a study; each is a case with a file."""
     measures_mode: ClassVar[bool] = False
-    """Whether the mode's parameters have to be free."""
+    """Whether the mode's parameters must be free."""
     seeded: ClassVar[str] = "noise"
-    """What is random, from ``seed``."""
+    """Name of the random quantity generated from ``seed``."""
     strain: float
-    """Of the deformed image [-]."""
+    """Nominal strain of the deformed image [-]."""
     seed: int
 
     @property
     def seeds(self) -> str:
-        """The seeds of all that is random, as text for the report."""
+        """The seeds of all random numbers, as text for the report."""
         return f"seed {self.seed} of the {self.seeded}"
 
     def require(self, correlation: SquareLatticeOptions) -> None:
@@ -262,18 +262,18 @@ class Study(ABC, Generic[A]):
 
     @staticmethod
     def require_different(name: str, values: tuple[Any, ...]) -> None:
-        """Raise InputError if a value comes twice."""
+        """Raise InputError if a value occurs twice."""
         if len(set(values)) < len(values):
             raise InputError(f"study: expected {name} that differ, got {list(values)}")
 
     @abstractmethod
     def quick(self) -> Self:
-        """The same question with fewer cases: a first look."""
+        """The same study with fewer cases, for a first result."""
 
     @abstractmethod
     def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
-        """Make what the cases share (images) in ``folder``; returns them, each with its seed."""
+        """Make what the cases share (images) in ``folder``; return the cases with their seeds."""
 
     @abstractmethod
     def analyse(self, table: pd.DataFrame, folder: Path) -> A:
-        """What a table with a row for each case says; failed ones have an ``error``."""
+        """Evaluate the table, which has a row for each case; failed cases have an ``error``."""

@@ -29,7 +29,7 @@ _DEGREES = (2, 3, 4, 5, 6, 7, 8)
 
 
 def changed(thing: T, options: str, **values: Any) -> T:
-    """A dataclass of dataclasses with other values in the one at a dotted path; "" is itself."""
+    """Replace values in the dataclass at a dotted path of nested dataclasses; "": ``thing``."""
     name, _, rest = options.partition(".")
     if name:
         values = {name: changed(getattr(thing, name), rest, **values)}
@@ -39,33 +39,33 @@ def changed(thing: T, options: str, **values: Any) -> T:
 
 @dataclass(frozen=True)
 class VariedFactor:
-    """Something to change."""
+    """An option of imaging or correlation that a study varies."""
 
     label: str
-    """What it is called, with its unit."""
+    """Name with unit."""
     levels: tuple[float, ...]
-    """What it is changed to unless a study says otherwise, for a choice the numbers of its
+    """Default levels; for a choice, the indices of its
     ``names``."""
     change: Callable[[StudySetting, Any], StudySetting]
-    """The setting with that level."""
+    """Returns the setting with a given level."""
     level_of: Callable[[StudySetting], float | None]
-    """The level that a setting has, None where it has none."""
+    """Returns the level of a setting, None if it has none."""
     whole: bool = False
     """Whether levels are whole numbers."""
     by_camera: bool = False
-    """Whether only a camera's images have a level: float images have no bits, and no contrast."""
+    """Whether only camera images have a level: float images have no bit depth, for example."""
     names: tuple[str, ...] = ()
 
     @classmethod
     def option(cls, label: str, path: str, levels: tuple[float, ...], **kind: Any) -> Self:
-        """The option at a dotted path of a :class:`StudySetting`."""
+        """A factor for the option at a dotted path of a :class:`StudySetting`."""
         at, _, name = path.rpartition(".")
         value = attrgetter(path)
         return cls(label, levels, lambda s, v: changed(s, at, **{name: v}), value, **kind)
 
     @classmethod
     def choice(cls, label: str, option: str, names: tuple[str, ...]) -> VariedFactor:
-        """One of several names of an option of the correlation, or none: left to the images."""
+        """A factor whose levels are names of a correlation option; no level if left automatic."""
         numbers = {name: number for number, name in enumerate(names)}
         return cls(
             label, tuple(numbers.values()),
@@ -74,7 +74,7 @@ class VariedFactor:
         )  # fmt: skip
 
     def number(self, level: float | str) -> float:
-        """A level as a number; InputError if it is none of the factor's."""
+        """A level as a number; InputError if the factor has no such level."""
         by_name = isinstance(level, str)
         known = self.names if by_name else range(len(self.names))
         if (by_name or self.names) and level not in known:
@@ -86,24 +86,24 @@ class VariedFactor:
         return number
 
     def label_of(self, level: float) -> str:
-        """How a level is called."""
+        """Text for a level."""
         return self.names[round(level)] if self.names else f"{level:g}"
 
     def set(self, setting: StudySetting, level: float | str) -> StudySetting:
-        """Change a setting; InputError if the level is out of the factor's range."""
+        """The setting with this level; InputError if it is out of the factor's range."""
         number = self.number(level)
         other = self.change(setting, round(number) if self.whole else float(number))
         return changed(other, "correlation", camera=True) if self.by_camera else other
 
     def base(self, setting: StudySetting) -> float | None:
-        """The level of the images that a setting correlates; None where they have none."""
+        """The level of the images that a setting correlates; None if they have none."""
         if self.by_camera and not setting.correlation.camera:
             return None
         return self.level_of(setting)
 
 
 def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
-    """Everything about the speckle that much larger, its blur included."""
+    """The setting with a speckle coarser by ``factor``, including its blur."""
     if not factor > 0.0:
         raise InputError(f"study: expected a speckle_size above 0 times the base's, got {factor}")
     speckle = setting.imaging.speckle
@@ -113,7 +113,7 @@ def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
 
 
 def _contrast(setting: StudySetting, contrast: float) -> StudySetting:
-    """Grey levels about the same middle."""
+    """The setting with another contrast, about the same mean grey level."""
     speckle = setting.imaging.speckle
     middle = 0.5 * (speckle.dark + speckle.bright)
     middle = min(max(middle, 0.5 * contrast), 1.0 - 0.5 * contrast)
@@ -152,7 +152,7 @@ FACTORS: dict[str, VariedFactor] = {
         "pixels left out at edges [px]", "correlation.edge_px", (0, 1, 2, 3, 5, 8), whole=True
     ),
 }  # fmt: skip
-"""By the names that a study uses."""
+"""Factors by their names in a study."""
 
 BASE = "base"
 ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
@@ -160,23 +160,23 @@ ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
 
 @dataclass(frozen=True, eq=False)
 class SystematicAnalysis:
-    """What the table of a systematic study says."""
+    """Evaluation of the table of a systematic study."""
 
     rows: pd.DataFrame
-    """What succeeded, errors in pixels of the base; ``moved``: rms per component of a measurement's
-    difference from the base's on the same speckle [px]."""
+    """Cases that succeeded, errors in pixels of the base; ``moved``: rms per component of the
+    difference from the base's measurement on the same speckle [px]."""
     base: Mapping[str, float]
-    """Mean errors over the speckles."""
+    """Mean errors of the base over the speckles."""
     bases: Mapping[str, float | None]
-    """Each factor's level at the base; None where it has none."""
+    """Each factor's level at the base; None if it has none."""
 
 
 @dataclass(frozen=True)
 class SystematicStudy(Study[SystematicAnalysis]):
     """Correlate exact images with one option changed at a time.
 
-    InputError if a factor is unknown, levels are given for one that is not asked for, or a value
-    comes twice.
+    InputError if a factor is unknown, levels are given for a factor that is not varied, or a value
+    occurs twice.
     """
 
     question: ClassVar[str] = (
@@ -188,11 +188,11 @@ class SystematicStudy(Study[SystematicAnalysis]):
 
     strain: float = 0.128
     factors: tuple[str, ...] = tuple(FACTORS)
-    """What to change, names in :data:`FACTORS`."""
+    """Factors to vary, names in :data:`FACTORS`."""
     levels: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
-    """Other levels than a factor's own, by its name, numbers or names where it has names."""
+    """Levels by factor name, instead of the default ones: numbers, or names for a choice."""
     seeds_of_speckle: tuple[int, ...] = (0, 1)
-    """Every level is measured on each of these speckles."""
+    """Seeds of the speckles; every level is measured on each of them."""
 
     def __post_init__(self) -> None:
         unknown = [name for name in (*self.factors, *self.levels) if name not in FACTORS]
@@ -214,7 +214,7 @@ class SystematicStudy(Study[SystematicAnalysis]):
 
     @property
     def seeds(self) -> str:
-        """Of the speckles."""
+        """The seeds of the speckles, as text."""
         plural = "s" if len(self.seeds_of_speckle) > 1 else ""
         return f"seed{plural} {', '.join(map(str, self.seeds_of_speckle))} of the speckle"
 
@@ -227,7 +227,7 @@ class SystematicStudy(Study[SystematicAnalysis]):
         return replace(self, levels=levels, seeds_of_speckle=self.seeds_of_speckle[:1])
 
     def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
-        """Make the base's images, which many cases share; the others are made case by case."""
+        """Make the images of the base, shared by many cases; others are made case by case."""
         cases = []
         for seed in self.seeds_of_speckle:
             base = changed(spec.setting, "imaging.speckle", seed=seed)
@@ -249,11 +249,11 @@ class SystematicStudy(Study[SystematicAnalysis]):
         return tuple(factor.number(level) for level in self.levels.get(name, factor.levels))
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> SystematicAnalysis:
-        """Errors in pixels of the base, and how far each level moves the measurement."""
+        """Errors in pixels of the base, and the change of the measurement by each level."""
         setting = VirtualImagePair.open(folder, table["images"].iloc[0]).setting
         done = table[table["error"] == ""]
         base = done[done["factor"] == BASE]
-        # A ligament shows how large a level's own pixels are.
+        # The width of a ligament in pixels gives the pixel size of each level.
         in_base = base["pixels_per_ligament"].mean() / done["pixels_per_ligament"]
         pixels = {key: done[key] * in_base for key in ERRORS if key.endswith("_px")}
         rows = done.assign(**pixels, moved=_moved(done) / setting.imaging.pixel_size)
@@ -265,7 +265,7 @@ class SystematicStudy(Study[SystematicAnalysis]):
 
 
 def _moved(done: pd.DataFrame) -> pd.Series:
-    """Rms per component of a measurement's difference from the base's on the same speckle [mm]."""
+    """Rms per component of the difference from the base's measurement, same speckle [mm]."""
     base = done[done["factor"] == BASE].set_index("seed")["at_junctions_mm"]
 
     def moved(row: pd.Series) -> float:
@@ -278,11 +278,11 @@ def _moved(done: pd.DataFrame) -> pd.Series:
 
 
 def one_level(case: Case, folder: Path) -> Row:
-    """Image, correlate and set against the truth; images that no other case needs are removed.
+    """Image, correlate and compare with the truth; images that no other case needs are removed.
 
     Errors as in :meth:`~modeharvest.validation.studies.study.VirtualImagePair.errors`;
-    ``pixels_per_ligament``: its width [px]; ``at_junctions_mm``: displacement (x, y) at the
-    junctions between holes [mm].
+    ``pixels_per_ligament``: width of a ligament [px]; ``at_junctions_mm``: displacement (x, y) at
+    the junctions between holes [mm].
     """
     pair = VirtualImagePair.open(folder, case["images"])
     ligament = pair.specimen.largest_diameter - pair.specimen.diameter
@@ -301,7 +301,7 @@ def one_level(case: Case, folder: Path) -> Row:
 
 
 def _at_junctions(pair: VirtualImagePair, result: Result) -> FloatArray:
-    """(junctions, 2) displacement between four holes each [mm]."""
+    """(junctions, 2) displacement at the centres between four holes [mm]."""
     s = pair.specimen
     x, y = (
         distance * (np.arange(count + 1, dtype=np.float64) - 0.5 * count)

@@ -1,12 +1,12 @@
 """Transfer functions of least-squares fits: subsets, polynomials, and an ansatz near a state.
 
-A local DIC whose subsets have polynomial shape functions is, to first order, the least-squares fit
-of these to the displacement in the subset, read at its centre: a Savitzky–Golay filter [1]_, [2]_.
-A global one with polynomials over the whole domain is the same fit there. The share of a wave's
-amplitude that comes back is its transfer T; the finest period is the one with T = 0.9 [2]_.
+Local DIC with polynomial shape functions is, to first order, their least-squares fit to the
+displacement in the subset, evaluated at its centre: a Savitzky–Golay filter [1]_, [2]_. Global DIC
+with polynomials over the whole domain is the same fit over the domain. The measured share of a
+wave's amplitude is its transfer T; the finest period is the one with T = 0.9 [2]_.
 
-Near a state a an ansatz can follow small changes S da of the displacement; the best it can make of
-a wave w are the da that minimise the sum of |w - S da|^2 over the material. A correlation weighs
+Near a state a, an ansatz can describe small changes S da of the displacement. Its best fit to a
+wave w has the da that minimise the sum of |w - S da|^2 over the material. A correlation weights
 the same sum by the speckle's gradient, which averages out over many speckles.
 
 References
@@ -37,26 +37,26 @@ from modeharvest.validation.studies.buckled import AddedWave, ResolutionSpec
 
 _SCAN = 4001
 WAVED = ("v0", "v1")
-"""What a wave is of."""
+"""Parts of the ansatz to which waves are added."""
 AXES = ("x", "y")
 _PERIODS = 80
 _SHORTEST, _LONGEST = 0.6, 8.0
-"""Of the periods, in cells and in lengths of the specimen."""
+"""Shortest period [cells] and longest period [lengths of the specimen]."""
 _PHASES = (0.0, 0.5 * np.pi)
 QUANTITIES = ("v0", "v1", "v1phi1", "u")
 _FLOOR_OF = {"v0": "v0", "v1": "v1phi1"}
-"""Whose noise counts against the waves of a part."""
+"""Field whose noise floor is combined with l10 of a part's waves."""
 _SUBSET_PX = 33
-"""A subset whose indicator stands for all: theory gives nearly the same for every size."""
+"""Edge of the subset for the indicator [px]: by theory it hardly depends on the size."""
 Kind = tuple[str, int, int]
 """Part, axis and degree."""
 
 
 def affine_subset_transfer(width: int, period: FloatArray) -> FloatArray:
-    """(...) T of a square affine subset for waves along one of its edges, read at its centre [-].
+    """(...) T at the centre of a square affine subset for waves along one of its edges [-].
 
-    Dirichlet's kernel sin(pi w/p) / (w sin(pi/p)), as of a mean over the subset. ``width``: its
-    edge w, odd [px]; ``period``: (...) of the wave [px].
+    Dirichlet's kernel sin(pi w/p) / (w sin(pi/p)), the same as for a mean over the subset.
+    ``width``: its edge w, odd [px]; ``period``: (...) period p of the wave [px].
     """
     phase = np.pi / period
     return np.asarray(np.sin(width * phase) / (width * np.sin(phase)))
@@ -65,8 +65,8 @@ def affine_subset_transfer(width: int, period: FloatArray) -> FloatArray:
 def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high: float) -> float:
     """The period between ``low`` and ``high`` above which a transfer stays at 0.9 or more.
 
-    ``transfer``: from periods (n,) to T (n,); InputError if it is below 0.9 at the longest period
-    or nowhere.
+    ``transfer``: from periods (n,) to T (n,); InputError if T is below 0.9 at the longest period
+    or at no period.
     """
     periods = np.asarray(np.geomspace(low, high, _SCAN), dtype=np.float64)
     below = np.flatnonzero(transfer(periods) < KEPT)
@@ -83,9 +83,9 @@ def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high
 def tangent_fit(
     ansatz: Ansatz, unknowns: FloatArray, points: FloatArray, waves: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The best fits of waves (m, 2, k) by an ansatz near some unknowns, at points (m, 2) [mm].
+    """Best fits of k waves (m, 2, k) [mm] by an ansatz linearised at ``unknowns``.
 
-    (m, 2, k) each: the changes of v0 and of v1 phi1, which add up to that of the displacement [mm].
+    Returns the changes of v0 and of v1 phi1 at ``points`` (m, 2) [mm], (m, 2, k) each; u's is both.
     """
     x, y = points.T
     S = ansatz.sensitivities(unknowns, x[:, None], y[:, None])[:, 0]
@@ -98,7 +98,7 @@ def tangent_fit(
 
 
 def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
-    """(k,) slope of what was found (m, 2, k) against the waves (m, 2, k) [-]."""
+    """(k,) regression slopes of measured fields (m, 2, k) on the waves (m, 2, k) [-]."""
     return np.asarray((found * wave).sum(axis=(0, 1)) / (wave**2).sum(axis=(0, 1)))
 
 
@@ -107,11 +107,11 @@ class TransferCurves:
     """Transfers T over the period."""
 
     periods: FloatArray
-    """(n,) ascending [mm]."""
+    """(n,) periods, ascending [mm]."""
     own: dict[Kind, FloatArray]
     whole: dict[Kind, FloatArray]
-    """By (part, axis, degree) the share (n,) of a wave that is found in its own part, and in the
-    whole displacement, over both phases [-]."""
+    """By (part, axis, degree): share (n,) of a wave measured in its own part, and in the whole
+    displacement, averaged over both phases [-]."""
 
     @classmethod
     def of(cls, spec: ResolutionSpec, degrees: Sequence[int], progress: Progress = silent) -> Self:
@@ -140,12 +140,12 @@ class TransferCurves:
         return float(np.interp(period, self.periods, self.own[part, axis, degree]))
 
     def finest(self, part: str, axis: int, degree: int) -> float:
-        """l10 [mm], from which on less than 10 % is lost; InputError if there is no such period."""
+        """l10 [mm], the period above which less than 10 % is lost; InputError if there is none."""
         periods, curve = self.periods, self.own[part, axis, degree]
         return finest_period(lambda p: np.interp(p, periods, curve), periods[0], periods[-1])
 
     def cross_talk(self) -> tuple[float, float]:
-        """Largest share of a wave of one part found in the other: at any period, from l10 on."""
+        """Largest share of one part's wave measured in the other: at all periods, above l10."""
         everywhere = resolved = 0.0
         for key, own in self.own.items():
             other = np.abs(self.whole[key] - own)
@@ -155,7 +155,7 @@ class TransferCurves:
 
 
 def _over_phases(found: FloatArray, wave: FloatArray) -> FloatArray:
-    """(n,) shares of waves (m, 2, 2 n), those of the two phases weighted by their power."""
+    """(n,) shares of waves (m, 2, 2 n); the two phases of a wave are weighted by their power."""
     power = (wave**2).sum(axis=(0, 1)).reshape(-1, len(_PHASES))
     shares = wave_share(found, wave).reshape(-1, len(_PHASES))
     return np.asarray((shares * power).sum(axis=1) / power.sum(axis=1))
@@ -163,21 +163,21 @@ def _over_phases(found: FloatArray, wave: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Passband:
-    """What becomes of a pattern of another wavelength than the mode's; (n,) each [-]."""
+    """Transfer of patterns with another wavelength than the mode's; (n,) each [-]."""
 
     stretch: FloatArray
-    """Its wave numbers over the mode's."""
+    """Wave numbers of the pattern over the mode's."""
     added: FloatArray
-    """Share that is found of a small one added to the mode: a filter."""
+    """Measured share of a small such pattern added to the mode: a linear filter."""
     itself: FloatArray
-    """Share that is found of the pattern itself where it is that long, by a fit that starts from
+    """Measured share if the whole pattern has this wavelength, by a nonlinear fit that starts from
     the mode."""
     wavelength_error: FloatArray
-    """Relative, of that fit."""
+    """Relative error of the wave numbers in that fit."""
 
     @classmethod
     def of(cls, spec: ResolutionSpec, degree: int) -> Passband:
-        """At one degree of v0 and v1."""
+        """Compute it for one degree of v0 and v1."""
         points, buckled = spec.points, spec.buckled
         ansatz, start = buckled.ansatz(degree, degree), buckled.start(degree, degree)
         stretch = np.concatenate([np.linspace(0.05, 0.8, 26), np.linspace(0.82, 1.3, 33)])
@@ -191,14 +191,14 @@ class Passband:
 
     @property
     def retuned(self) -> float:
-        """How far off its wave numbers may be for the pattern to be found whole, both ways [-]."""
+        """Largest |stretch - 1| up to which the fit finds the whole pattern, both ways [-]."""
         whole, off = self.itself > 0.999, np.abs(self.stretch - 1.0)
         lost = off[~whole & np.isfinite(self.itself)].min(initial=np.inf)
         return float(off[whole & (off < lost)].max(initial=0.0))
 
 
 def _stretched(spec: ResolutionSpec, stretch: float, points: FloatArray) -> FloatArray:
-    """(..., 2) the pattern with wave numbers so many times the mode's, v1 = 1 mm."""
+    """(..., 2) the pattern with the mode's wave numbers times ``stretch``, v1 = 1 mm [mm]."""
     ansatz, a = spec.buckled.truth
     a = a.copy()
     a[ansatz.v_slice(0)] = 1.0
@@ -209,7 +209,7 @@ def _stretched(spec: ResolutionSpec, stretch: float, points: FloatArray) -> Floa
 
 
 def _refitted(spec: ResolutionSpec, degree: int, stretch: float) -> tuple[float, float]:
-    """Share of a stretched pattern that a fit from the mode finds; its wave number's error."""
+    """Share of a stretched pattern found by a fit from the mode; relative wave number error."""
     buckled = spec.buckled
     step = 4.0 * buckled.pixel_size
     cols, rows = (2 * int(np.ceil(half / step)) + 1 for half in buckled.specimen.half_size)
@@ -231,18 +231,18 @@ def _refitted(spec: ResolutionSpec, degree: int, stretch: float) -> tuple[float,
 
 @dataclass(frozen=True)
 class DegreeResolution:
-    """A degree of v0 and v1, and what it costs."""
+    """Resolution and noise floor for one degree of v0 and v1."""
 
     degree: int
     unknowns: int
     finest_px: Mapping[str, float]
     """l10 of waves by part and axis, as "v0 x" [px]."""
     floor_px: Mapping[str, float]
-    """n by quantity, :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px]."""
+    """Noise floor n by quantity (:data:`QUANTITIES`), by 2 s^2 M^-1 of the buckled images [px]."""
     indicator_px2: Mapping[str, float]
-    """n l10 by part, l10 the geometric mean of both axes' [px^2]."""
+    """n l10 by part, with the geometric mean of l10 over both axes [px^2]."""
     fixed_px2: float
-    """That of v1 phi1 without motion [px^2]."""
+    """n l10 of v1 phi1 with n from images without motion [px^2]."""
 
 
 def degrees_of(
@@ -273,7 +273,7 @@ def degrees_of(
 
 
 def subset_indicator(spec: ResolutionSpec) -> float:
-    """n l10 of an affine subset on the same speckle under the same noise, by theory [px^2].
+    """Theoretical n l10 of an affine subset for the same speckle and noise [px^2].
 
     Noise is averaged over the subset: n = sqrt(2) s / (w G), with the rms gradient G of the speckle
     along the displacement [1/px].

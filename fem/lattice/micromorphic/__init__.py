@@ -1,1 +1,1 @@
-"""Micromorphic homogenization: patterns given beforehand, at two scales solved as one."""
+"""Micromorphic homogenization with given patterns; both scales are solved simultaneously."""

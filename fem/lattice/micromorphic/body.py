@@ -20,11 +20,11 @@ from modeharvest.util.elements import reference_element, shape_functions, shape_
 from modeharvest.util.errors import InputError
 
 EDGES = ("left", "bottom", "right", "top")
-"""Plates are left and right, sides bottom and top."""
+"""Names of the edges: plates are left and right, sides are bottom and top."""
 SIDES = ("free", "periodic", "guided", "clamped")
 PATTERN = ("zero", "free")
 
-# Of Gauss points on a triangle, for degrees 2 and 4: barycentric coordinate a of (a, a, 1 - 2 a).
+# Gauss points on a triangle for degrees 2 and 4: a in the barycentric coordinates (a, a, 1 - 2 a).
 _TRIANGLE_RULES = {
     2: [(1 / 6, 1 / 6)],
     3: [(0.445948490915965, 0.111690794839005), (0.091576213509771, 0.054975871827661)],
@@ -33,12 +33,12 @@ _TRIANGLE_RULES = {
 
 @dataclass(frozen=True)
 class PlateMotion:
-    """Two plates at the edges of least and largest x, moved in proportion to the load e.
+    """Two plates at the edges of smallest and largest x, moved in proportion to the load e.
 
     At x = +-a they have u_x = -+ e L (compression + bending y / b) / 2 and u_y = +- e L shear / 2
-    - e lateral y, with b half the height: e is the nominal strain of ``compression = 1``, the mean
-    shear of ``shear = 1``, the nominal strain of the uppermost fibre of ``bending = 1`` (small
-    turns), and with ``lateral = 1`` the nominal strain across, too, for sides that aren't free.
+    - e lateral y, with b half the height. So e is the nominal strain for ``compression = 1``, the
+    mean shear for ``shear = 1``, the nominal strain of the uppermost fibre for ``bending = 1``
+    (small rotations), and the lateral nominal strain for ``lateral = 1`` (sides that aren't free).
     """
 
     compression: float = 1.0
@@ -46,23 +46,23 @@ class PlateMotion:
     bending: float = 0.0
     lateral: float = 0.0
     plates: str = "clamped"
-    """With "sliding", u_y is free on the plates but for one node, which keeps the body there."""
+    """With "sliding", u_y is free on the plates except at one node, which fixes the body."""
     sides: str = "free"
-    """The edges of least and largest y: "free"; "periodic": v is alike on both, and u but for the
-    lateral strain; "guided": u_y is linear between the plates; "clamped": u_x is, too."""
+    """The edges of smallest and largest y: "free"; "periodic": equal v on both, and equal u up to
+    the lateral strain; "guided": u_y is linear between the plates; "clamped": u_x is, too."""
 
 
 @dataclass(frozen=True)
 class PlateLoading(PlateMotion):
-    """A load, what holds the pattern, and whether only a quarter is looked at."""
+    """A load, the boundary conditions of the pattern, and whether only a quarter is modelled."""
 
     pattern_at_plates: str = "zero"
     pattern_at_bulk: str = "zero"
-    """Whether v is 0 where the lattice meets a plate, solid before a plate, or a clamped side, and
-    where it meets other solid bulk, such as along the sides; or "free": Lambda . n = 0."""
+    """"zero" for v = 0, "free" for Lambda . n = 0: where the lattice meets a plate, solid next to a
+    plate or a clamped side; and where it meets other solid bulk, such as along the sides."""
     quarter: bool = False
-    """Whether the body is the quarter x, y >= 0 of one that is its own mirror image: u symmetric,
-    v even. Compression only. Instabilities of another symmetry, such as bowing, aren't seen."""
+    """Whether only the quarter x, y >= 0 of a symmetric body is modelled: u symmetric, v even.
+    Compression only. Instabilities of another symmetry, such as bowing, are not found."""
 
     def __post_init__(self) -> None:
         require_edges(self.plates)
@@ -85,22 +85,22 @@ class PlateLoading(PlateMotion):
 
 
 class Quadrature(NamedTuple):
-    """The points of some elements (c), p in each, with k nodes."""
+    """Gauss points of c elements with k nodes, p points in each."""
 
     weights: FloatArray
-    """(c, p) areas [mm^2]."""
+    """(c, p) weights, as areas [mm^2]."""
     shapes: FloatArray
     """(p, k) shape functions."""
     gradients: FloatArray
-    """(c, p, k, 2) their gradients [1/mm]."""
+    """(c, p, k, 2) gradients of the shape functions [1/mm]."""
     places: FloatArray
-    """(c, p, 2) [mm]."""
+    """(c, p, 2) positions of the points [mm]."""
 
 
 def quadrature(mesh: Mesh, points: int) -> Quadrature:
-    """Gauss points of all elements: ``points`` 2 or 3 a direction (3 or 6 in a triangle).
+    """Gauss points of all elements: ``points`` is 2 or 3 per direction (3 or 6 in a triangle).
 
-    An InputError refuses other numbers, and elements whose Jacobian isn't positive.
+    InputError for other numbers, and for elements whose Jacobian isn't positive.
     """
     if points not in (2, 3):
         raise InputError(f"quadrature: expected 2 or 3 points a direction, got {points}")
@@ -127,7 +127,7 @@ def quadrature(mesh: Mesh, points: int) -> Quadrature:
 
 
 def rectangle_mesh(x: Sequence[float], y: Sequence[float]) -> Mesh:
-    """Q8 elements between ascending places along x and along y [mm]."""
+    """Mesh of Q8 elements between ascending positions along x and along y [mm]."""
     at = []
     for places in (x, y):
         ends = np.asarray(places, dtype=np.float64)
@@ -147,15 +147,15 @@ def specimen_mesh(
     specimen: Specimen, divisions: tuple[int, int] | None = None, quarter: bool = False,
     edge_shifts: ArrayLike = (0.0, 0.0),
 ) -> tuple[Mesh, BoolArray]:  # fmt: skip
-    """Q8 elements of a specimen, and which of them (m,) are lattice; the others are solid bulk.
+    """Q8 mesh of a specimen, and (m,) True for elements of the lattice; others are solid bulk.
 
-    divisions : of the cellular part along x and y; by default one for two holes, at least two.
-    quarter : only that with x, y >= 0, of half the divisions (rounded up).
-    edge_shifts : by how much the lattice is longer and higher at each of its ends [mm].
+    divisions : of the cellular part along x and y; by default one per two holes, at least two.
+    quarter : mesh only the part x, y >= 0, with half the divisions (rounded up).
+    edge_shifts : extension of the lattice at each of its ends along x and y [mm].
     """
     shifts, edges = np.asarray(edge_shifts), np.array([specimen.bulk_x, specimen.bulk_y])
     whole = specimen.half_size + shifts
-    # Next to solid edges of staggered rows as much is lattice as their holes' cells fill.
+    # Next to solid edges of staggered rows, the lattice has the area that the holes' cells fill.
     cells = specimen.row_counts.mean(), specimen.holes_y
     filled = 0.5 * np.array(cells) * (specimen.pitch, specimen.row_distance)
     half = np.where(edges > 0.0, filled, specimen.cellular_half_size) + shifts
@@ -173,20 +173,20 @@ def specimen_mesh(
 
 
 class BodyMesh(NamedTuple):
-    """What a file says of a homogenized body."""
+    """A homogenized body's mesh from a file."""
 
     mesh: Mesh
     is_lattice: BoolArray
-    """(m,) which elements aren't solid bulk."""
+    """(m,) True for elements that aren't solid bulk."""
     edges: Mapping[str, IntArray]
-    """Node numbers of those of ``EDGES`` that the file names."""
+    """Node numbers of the edges among ``EDGES`` that are named in the file."""
 
 
 def read_body_mesh(path: Path | str) -> BodyMesh:
-    """Read a macroscopic mesh [mm] of T3, T6, Q4, Q8 or Q9 from any file that meshio reads.
+    """Read a macroscopic mesh [mm] of T3, T6, Q4, Q8 or Q9 from a file in any format of meshio.
 
-    Sets of elements (physical groups of gmsh's format 4.1) named "bulk" are solid, those named as
-    ``EDGES`` plates and sides. An InputError refuses what can't be read, and pieces apart.
+    Sets of elements (physical groups of gmsh's format 4.1) named "bulk" are solid; sets named as in
+    ``EDGES`` are plates and sides. InputError if it can't be read, or has separate pieces.
     """
     source = read_any_mesh(path)
     whole = plane_mesh(source, path)

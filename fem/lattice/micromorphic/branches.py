@@ -1,8 +1,8 @@
-"""What a homogenized specimen does under load: primary path, critical point, buckled branches.
+"""Response of a homogenized specimen to its load: primary path, critical point, branches.
 
-A body that has its lattice's symmetry keeps v = 0 for ever, so a branch is entered by its
-amplitude: that is prescribed, and the load is found, which is regular at the critical point and
-where the load has a maximum or minimum. States at given loads are then met exactly.
+A body with its lattice's symmetry keeps v = 0 on the primary path. A branch is therefore entered by
+prescribing its amplitude, with the load as an unknown. This is regular at the critical point and at
+maxima or minima of the load. States at given loads are then computed exactly.
 """
 
 from __future__ import annotations
@@ -26,32 +26,32 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
-_FARTHEST = 0.5  # of the pitch: the largest amplitude of a branch
-_SHORTEST = 0.02  # of the first amplitude: the smallest step
-_LIKE = 0.01  # overlap of a critical mode with a pattern below which there is none
-_ALIKE = 1e-6  # of 1: the cosine of directions that are one
-_OWN = 0.8  # cosine of a state's v with that of the mode its branch is to start along
+_FARTHEST = 0.5  # largest amplitude of a branch, over the pitch
+_SHORTEST = 0.02  # smallest step, over the first amplitude
+_LIKE = 0.01  # overlap of a critical mode with a pattern below which it counts as zero
+_ALIKE = 1e-6  # 1 - cosine below which two directions are the same
+_OWN = 0.8  # least cosine between a state's v and the v of the mode that starts its branch
 
 
 @dataclass(frozen=True, eq=False)
 class Homogenized:
-    """What a homogenized specimen does under load."""
+    """Response of a homogenized specimen to its load."""
 
     states: tuple[HomogenizedState, ...]
-    """At the loads asked for, ascending; buckled beyond the critical point."""
+    """States at the requested loads, ascending; buckled beyond the critical point."""
     criticals: tuple[HomogenizedCritical, ...]
-    """Those passed on the primary path; the branch starts at the last one."""
+    """Critical points on the primary path; the branch starts at the last one."""
     outcome: str
-    """How far it was followed, and why no farther."""
+    """How far the path was followed, and why no farther."""
     linearisations: int
-    """Of the whole body: as many factorisations of every RVE."""
+    """Number of linearisations of the body, each with one factorisation of every RVE."""
     ranked: tuple[tuple[tuple[float, ...], HomogenizedState], ...] = ()
-    """All branches of a degenerate critical point at one load, that of least energy, which
-    ``states`` follow, first: the pattern each starts along, and its state."""
+    """(pattern at the start, state) of all branches of a degenerate critical point at one load, by
+    ascending energy; ``states`` follow the first."""
 
     @property
     def critical(self) -> HomogenizedCritical | None:
-        """Where the pattern starts to grow, or without modes the first RVE becomes unstable."""
+        """The point where the pattern starts to grow, or, without modes, an RVE gets unstable."""
         found = [c for c in self.criticals if c.kind != "displacement"]
         return found[0] if found else None
 
@@ -62,9 +62,9 @@ def homogenize(
 ) -> Homogenized:  # fmt: skip
     """States of a homogenized specimen at some loads [-], positive and ascending.
 
-    On the primary path up to the first critical point at which a pattern grows, then on the branch
-    that it makes; of several (``ranked_branches``, at the first load) on that of least energy.
-    Critical points of u alone, before it, are kept in ``criticals`` and passed.
+    They are on the primary path up to the first critical point at which a pattern grows, then on
+    the branch from there; of several branches (``ranked_branches``, at the first load) on that of
+    least energy. Earlier critical points of u alone are passed, and kept in ``criticals``.
     """
     wanted = np.asarray(loads, dtype=np.float64)
     if wanted.ndim != 1 or not len(wanted) or not (np.diff(wanted, prepend=0.0) > 0).all():
@@ -106,12 +106,12 @@ def follow_branch(
     path: HomogenizedPath, critical: HomogenizedCritical, loads: Sequence[float],
     pattern: Sequence[float] | None = None, progress: Progress = silent,
 ) -> tuple[list[HomogenizedState], str]:  # fmt: skip
-    """States on a branch that starts at a critical point, and how it ended.
+    """States on a branch that starts at a critical point, and the outcome as text.
 
-    One for each of the ``loads``, ascending, or fewer. Amplitudes are prescribed and grow;
-    the load is found, so that a branch whose load falls is followed too. It starts along the
-    critical mode, of several the combination, that is most like v = ``pattern`` (m,)
-    everywhere: all 1 unless given. The opposite is the other half of the branch.
+    There is one state for each of the ``loads``, ascending, or fewer. Growing amplitudes are
+    prescribed and the load is found, so that a branch with falling load is followed, too. It starts
+    along the critical mode, or the combination of several, nearest to v = ``pattern`` (m,)
+    everywhere (by default all 1). The opposite pattern gives the other half of the branch.
     """
     if not len(critical.modes):
         raise InputError("branch: expected a critical point of the body, got one of an RVE")
@@ -157,7 +157,7 @@ def follow_branch(
 def _combined(
     path: HomogenizedPath, critical: HomogenizedCritical, pattern: Sequence[float] | None
 ) -> FloatArray | None:
-    """The combination of critical modes nearest to a pattern, of size 1 mm; None if unlike all."""
+    """The combination of critical modes nearest to a pattern, of size 1 mm; None if orthogonal."""
     count = path.body.mode_count
     wanted = np.ones(count) if pattern is None else np.asarray(pattern, np.float64)
     if wanted.shape != (count,) or not np.any(wanted):
@@ -175,11 +175,11 @@ def _combined(
 def ranked_branches(
     path: HomogenizedPath, critical: HomogenizedCritical, load: float, progress: Progress = silent
 ) -> list[tuple[tuple[float, ...], HomogenizedState]]:
-    """The branches of a critical point at a load, that of least energy first.
+    """The branches of a critical point at a load, with their patterns, by ascending energy.
 
-    Those along single modes v_i and along sums of them with either sign, the first one positive,
-    each with its pattern. Left out are those that can't be followed, or end on that of another
-    pattern, which is so where a mesh splits the set; and patterns that the modes don't tell apart.
+    They start along single modes v_i and along sums with any signs, the first one positive. Omitted
+    are branches that can't be followed or end on another pattern's branch (if a mesh splits the
+    degenerate modes), and patterns with the same combination of critical modes as another.
     """
     signs = product((0.0, 1.0, -1.0), repeat=path.body.mode_count)
     patterns = [p for p in signs if next((x for x in p if x), 0.0) > 0]
@@ -198,4 +198,4 @@ def ranked_branches(
         met += [(pattern, state) for state, v in fields
                 if np.sum(v * start) > _OWN * size(v) * size(start)]  # fmt: skip
         progress(k, len(patterns), "branches")
-    return sorted(met, key=lambda item: float(f"{item[1].energy:.9e}"))  # alike: as they come
+    return sorted(met, key=lambda item: float(f"{item[1].energy:.9e}"))  # stable for equal energies

@@ -1,11 +1,11 @@
-"""A homogenized body: finite elements of u, v_i and their gradients, with RVEs at their points.
+"""A homogenized body: finite elements of u and v_i, with RVEs at their quadrature points.
 
     div P̄ = 0,    div Lambda_i - Pi_i = 0,
 
-weakly, with u and all v_i interpolated alike. Every quadrature point of the lattice has one RVE, or
-several in different positions whose mean counts; solid bulk has its material. Both scales are
-linearised together: one factorisation an RVE and iteration, then one of the body. RVEs
-are shared out over the ranks of a communicator; everything else every rank has.
+in weak form, with the same interpolation of u and all v_i. Every quadrature point of the lattice
+has one RVE, or several in different positions that are averaged; solid bulk has its material. Both
+scales are linearised together: in each iteration one factorisation per RVE, then one of the body.
+RVEs are distributed over the ranks of a communicator; all other data are on every rank.
 """
 
 from __future__ import annotations
@@ -36,32 +36,32 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.machine import require_memory
 
 _FIRST_ORDER = 4  # generalised strains without modes: F̄
-_STATES = 4  # of all RVEs in memory at a time, at least
+_STATES = 4  # least number of states of all RVEs in memory at a time
 
 
 class _Region(NamedTuple):
-    """Elements of one kind, lattice or bulk."""
+    """The elements of one kind, lattice or bulk."""
 
     at: Quadrature
     B: FloatArray
-    """(c, p, s, d) generalised strains of unit unknowns."""
+    """(c, p, s, d) generalised strains due to unit unknowns."""
     dofs: IntArray
-    """(c, d) of all unknowns."""
+    """(c, d) numbers of the elements' unknowns among all."""
 
 
 class HomogenizedBody:
-    """A body of a homogenized lattice, perhaps with solid bulk, between two plates.
+    """A body of a homogenized lattice, possibly with solid bulk, between two plates.
 
-    Unknown are ``free_count`` numbers y; all unknowns a are those or follow the load. Nodal values
-    are ``fields(a)``. An InputError refuses RVEs with differing numbers of modes, supports that
-    leave it loose, and more ranks than RVEs.
+    The free unknowns are y (``free_count``,); all unknowns a follow from y and the load. Nodal
+    values are ``fields(a)``. InputError for RVEs with different numbers of modes, supports that
+    allow rigid motions, and more ranks than RVEs.
 
-    mesh : T3, T6, Q4, Q8 or Q9 [mm].
-    rves : one, or several that are averaged at every point.
-    extent : L and the height, which the load refers to [mm]; by default those of the mesh.
-    is_lattice : which elements (m,) are not solid, of the RVEs' material; by default all.
-    points : Gauss points a direction; by default 2, of Q9, which 2 would leave loose, 3.
-    edges : nodes of plates and sides, by names among ``EDGES``; by default those of least and
+    mesh : T3, T6, Q4, Q8 or Q9 mesh [mm].
+    rves : one RVE, or several that are averaged at every point.
+    extent : length L and height to which the load refers [mm]; by default those of the mesh.
+    is_lattice : (m,) True for lattice elements; the others are solid, of the RVEs' material.
+    points : Gauss points per direction; by default 2, for Q9 3, as 2 would be rank-deficient.
+    edges : nodes of plates and sides, by names among ``EDGES``; by default those of smallest and
         largest x and y.
     """
 
@@ -82,7 +82,7 @@ class HomogenizedBody:
         self.mode_count, self.is_lattice = counts.pop(), lattice
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
         self.copies = 4 if loading.quarter else 1
-        """How many such bodies make up the whole."""
+        """Number of such bodies in the whole body."""
         whole = (high - low) * math.sqrt(self.copies) if extent is None else np.asarray(extent)
         self.length = float(whole[0])
         self._lattice_nodes = np.unique(mesh.cells[lattice])
@@ -97,7 +97,7 @@ class HomogenizedBody:
         if comm.size > count:
             raise InputError(f"MPI: expected at most {count} ranks, one an RVE, got {comm.size}")
         self.own = np.arange(comm.rank, count, comm.size)
-        """Numbers of this rank's RVEs: point times RVEs a point plus which of them."""
+        """Numbers of this rank's RVEs: point times RVEs per point, plus index at the point."""
         sizes = [self.rve(k).cell.reduction.size for k in self.own]
         self.offsets = self.free_count + np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
@@ -107,29 +107,29 @@ class HomogenizedBody:
         divisions: tuple[int, int] | None = None, edge_shifts: ArrayLike = (0.0, 0.0),
         points: int | None = None,
     ) -> HomogenizedBody:  # fmt: skip
-        """A rectangle of holes with its bulk edges; divisions and shifts as ``specimen_mesh``'s."""
+        """The body of a specimen with its bulk edges; arguments as in ``specimen_mesh``."""
         mesh, lattice = specimen_mesh(specimen, divisions, loading.quarter, edge_shifts)
         extent = specimen.length, 2.0 * specimen.half_size[1]
         return cls(mesh, rves, loading, extent, lattice, points)
 
     def rve(self, number: int | np.int64) -> RVE:
-        """The RVE of a number among those of all points."""
+        """The RVE with a given number among those of all points."""
         return self.rves[number % len(self.rves)]
 
     @property
     def start(self) -> FloatArray:
-        """The undeformed state: y, then w of this rank's RVEs one after the other."""
+        """The undeformed state: y, followed by w of each of this rank's RVEs."""
         return np.zeros(self.offsets[-1])
 
     @property
     def places(self) -> FloatArray:
-        """(points, 2) of the lattice's quadrature points [mm]."""
+        """(points, 2) positions of the lattice's quadrature points [mm]."""
         return self.regions[0].at.places.reshape(-1, 2)
 
     def microstructure(self, value: FloatArray, strains: FloatArray, number: int) -> FloatArray:
-        """(n, 2) displacement [mm] of the nodes of an RVE's cell in a state; on every rank.
+        """(n, 2) displacement of the nodes of an RVE's cell in a state [mm]; on every rank.
 
-        ``value`` and ``strains`` are the state's, ``number`` point times RVEs a point plus which.
+        ``value`` and ``strains`` are those of the state; ``number``: see ``own``.
         """
         owner, at = number % self.comm.size, number // self.comm.size
         own = self.fluctuations(value)[at] if owner == self.comm.rank else None
@@ -145,21 +145,21 @@ class HomogenizedBody:
         return np.asarray(self.T @ value[: self.free_count] + load * self.direction)
 
     def fields(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) u [mm] and (n, m) v_i of the nodes, NaN where there is no lattice."""
+        """(n, 2) u [mm] and (n, m) v_i of the nodes; v_i is NaN outside the lattice."""
         nodal = unknowns.reshape(-1, 2 + self.mode_count)
         v = np.full((len(nodal), self.mode_count), np.nan)
         v[self._lattice_nodes] = nodal[self._lattice_nodes, 2:]
         return nodal[:, :2], v
 
     def strains(self, unknowns: FloatArray) -> list[FloatArray]:
-        """(points, s) generalised strains, of the lattice and, if there is any, of the bulk."""
+        """(points, s) generalised strains of the lattice and, if any, of the bulk."""
         found = [np.einsum("cpsd,cd->cps", r.B, unknowns[r.dofs]) for r in self.regions]
         for q in found:
             q[..., :_FIRST_ORDER] += np.eye(2).ravel()
         return [q.reshape(-1, q.shape[-1]) for q in found]
 
     def _require_memory(self, points: int) -> None:
-        """Refuse more RVEs than there is memory for, roughly."""
+        """Raise InputError if the RVEs would need more memory than there is, by an estimate."""
         (elements, nodes), m = self.mesh.cells.shape, self.mode_count
         count, strains = points**2 * elements, (_FIRST_ORDER + 3 * m) * (2 + m) * nodes
         own = sum(rve.cell.reduction.size for rve in self.rves) / self.comm.size
@@ -183,7 +183,7 @@ class HomogenizedBody:
     def _constrain(
         self, low: FloatArray, high: FloatArray, b: float, edges: Mapping[str, IntArray]
     ) -> None:
-        """Which unknowns are free, which follow another one, and how the load moves the rest."""
+        """Find the free unknowns, those that follow others, and the motion by the load."""
         nodes, loading, n = self.mesh.nodes, self.loading, len(self.mesh.nodes)
         near, half = 1e-6 * float((high - low).max()), np.array([0.5 * (high - low)[0], b])
         is_at = [near > np.abs(nodes - end)[:, axis] for end in (low, high) for axis in (0, 1)]
@@ -209,7 +209,7 @@ class HomogenizedBody:
         if loading.sides == "clamped":
             fixed[sides, 0], plates = True, plates | sides
         fixed[np.setdiff1d(np.arange(n), self._lattice_nodes), 2:] = True
-        # Solid strips beyond the lattice's ends go with the plates, all others are bulk.
+        # Solid strips beyond the lattice's ends belong to the plates, others are bulk.
         solid, ends = self.mesh.cells[~self.is_lattice], nodes[self._lattice_nodes, 0]
         middle = nodes[solid, 0].mean(axis=1)
         is_strip = (middle < ends.min()) | (middle > ends.max())
@@ -220,7 +220,7 @@ class HomogenizedBody:
         self._eliminate(fixed != 0.0, direction, self._followed(bottom, top, near))
 
     def _followed(self, bottom: BoolArray, top: BoolArray, near: float) -> IntArray:
-        """(n,) the node whose fields each node's follow: itself, or its periodic partner."""
+        """(n,) the node whose fields each node follows: itself, or its periodic partner."""
         followed, x = np.arange(len(self.mesh.nodes)), self.mesh.nodes[:, 0]
         if self.loading.sides == "periodic":
             lower, upper = (np.flatnonzero(s)[np.argsort(x[s])] for s in (bottom, top))
@@ -232,23 +232,23 @@ class HomogenizedBody:
         return followed
 
     def _eliminate(self, fixed: BoolArray, direction: FloatArray, followed: IntArray) -> None:
-        """Number the free unknowns; an InputError if a rigid motion is among them."""
+        """Number the free unknowns; InputError if they allow a rigid motion."""
         is_free = ~fixed & (followed == np.arange(len(fixed)))[:, None]
         numbers = np.where(is_free, np.cumsum(is_free).reshape(fixed.shape) - 1, -1)
         place = np.where(fixed, -1, numbers[followed]).ravel()
         offset = direction - direction[followed]
         self.direction: FloatArray = np.where(place < 0, direction.ravel(), offset.ravel())
-        """(size,) derivatives of all unknowns by the load, y fixed."""
+        """(size,) derivatives of all unknowns by the load at fixed y."""
         self.free_count, rows = int(is_free.sum()), np.flatnonzero(place >= 0)
         if not self.free_count:
             raise InputError("homogenized body: expected nodes between the supports, got none")
         shape = fixed.size, self.free_count
         self.T = csr_array((np.ones(len(rows)), (rows, place[rows])), shape)
-        """(size, free_count): all unknowns are T y + load * direction."""
+        """(size, free_count) matrix: all unknowns are T y + load * direction."""
         self.is_pattern: BoolArray = np.broadcast_to(np.arange(fixed.shape[1]) > 1, fixed.shape)[
             is_free
         ]
-        """(free_count,) which of y are amplitudes v."""
+        """(free_count,) True for entries of y that are amplitudes v."""
         X = self.mesh.nodes - self.mesh.nodes.mean(axis=0)
         rigid = np.zeros((*fixed.shape, 3))
         rigid[:, 0, 0] = rigid[:, 1, 1] = np.ptp(X)
@@ -261,11 +261,11 @@ class HomogenizedBody:
             raise InputError(f"{what} plates more than one node, clamp them or guide the sides")
 
     def picked(self, values: FloatArray) -> FloatArray:
-        """(free_count, ...) the y nearest to values of all unknowns (size, ...)."""
+        """(free_count, ...) least-squares y for values of all unknowns (size, ...)."""
         return np.asarray(((self.T.T @ values).T / self.T.sum(axis=0)).T)
 
     def assembled(self, parts: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, Any]:
-        """(size,) forces and (size, size) matrix of those of the regions' elements."""
+        """(size,) forces and (size, size) matrix assembled from those of the regions' elements."""
         forces, whole = np.zeros(len(self.direction)), csr_array((len(self.direction),) * 2)
         for region, (f, K) in zip(self.regions, parts, strict=True):
             rows, columns = np.broadcast_arrays(region.dofs[:, :, None], region.dofs[:, None, :])
@@ -289,14 +289,14 @@ class HomogenizedBody:
 
 
 class LinearisedBody:
-    """The equations of both scales at a trial state, the RVEs condensed.
+    """The equations of both scales at a trial state, with the RVEs condensed.
 
-    ``residual`` and ``load_force`` (free_count,) are the forces on y [N/mm], RVEs relaxed, and
-    their derivative by the load, ``relaxed`` and ``along`` the changes of y that balance them;
-    ``forces`` and ``along_load`` (size,) the same on all unknowns, ``load_size`` the norm of the
-    latter; ``stiffness`` is the derivative by y. ``excess`` is the largest imbalance of an RVE over
-    what a unit of F̄ makes there; ``negative`` the number of negative eigenvalues, ``rve_negative``
-    of the RVEs' at fixed strains.
+    ``residual`` and ``load_force`` (free_count,): forces on y with relaxed RVEs [N/mm], and their
+    derivative by the load; ``relaxed`` and ``along``: the changes of y that balance them.
+    ``forces`` and ``along_load`` (size,): the same on all unknowns; ``load_size``: norm of the
+    latter. ``stiffness``: derivative by y. ``excess``: largest imbalance of an RVE, relative to
+    the forces of a unit of F̄. ``negative``: number of negative eigenvalues; ``rve_negative``:
+    those of the RVEs at fixed strains.
     """
 
     stresses: FloatArray
@@ -339,7 +339,7 @@ class LinearisedBody:
         self.negative = factor.negative_pivots + self.rve_negative
 
     def _condense(self) -> None:
-        """Condense this rank's RVEs, and exchange what all ranks need of them."""
+        """Condense this rank's RVEs, and distribute the results to all ranks."""
         body, count = self.body, 4 + 3 * self.body.mode_count
         rows = np.full((len(body.own), count * (count + 1) + 2), np.nan)
         self._rves: list[tuple[FloatArray, FloatArray]] = []
@@ -362,7 +362,7 @@ class LinearisedBody:
         self.moduli = moduli.reshape(-1, count, count)
 
     def moved(self, dy: FloatArray, change: float, relax: bool = True) -> FloatArray:
-        """Change of the whole state by that of y and of the load; RVEs go into equilibrium too."""
+        """Change of the whole state for changes of y and load; ``relax``: RVEs to equilibrium."""
         body = self.body
         da = body.T @ dy + change * body.direction
         dq = np.einsum("cpsd,cd->cps", body.regions[0].B, da[body.regions[0].dofs])

@@ -1,11 +1,11 @@
-"""Extents of a homogenized specimen's lattice that make up for the energy of its edges.
+"""Extents of a homogenized specimen's lattice that compensate the energy of its edges.
 
-Beside plates and free sides, with the solid strips there, w isn't periodic, and homogenization is
-off by an energy for each row or column of cells that ends there. Such an excess is a matter of
-material and cell alone, and is an extent: as at Gibbs' dividing surfaces (Trans. Connecticut Acad.
-3 (1878) 343), the lattice ends where its energy is right. It is found, at rest, on one cell between
-plates, whose sides stay straight, and on one between free sides. Homogenized, the former is springs
-in series, the latter parallel ones, so that neither is solved for.
+Next to plates and free sides, with their solid strips, w isn't periodic, and the energy of the
+homogenized body has an error for each row or column of cells that ends there. This error depends
+on material and cell only and is expressed as an extent: as with Gibbs' dividing surfaces (Trans.
+Connecticut Acad. 3 (1878) 343), the lattice ends where its energy is right. Extents are computed
+at rest, on one cell between plates with straight sides, and on one between free sides. Homogenized,
+the former is springs in series, the latter springs in parallel: neither has to be solved.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from modeharvest.fem.specimen import Specimen
 def edge_shifts(
     specimen: Specimen, material: Material, mesh_size: float, loading: PlateMotion
 ) -> tuple[float, float]:
-    """By how much a lattice is longer at each plate and higher at each side [mm].
+    """Extensions of a lattice at each plate, along x, and at each side, along y [mm].
 
-    0 where no such extent is known: in other than square stacking, under shear or lateral strain,
-    at sides that aren't free. ``mesh_size``: of the elements of the RVE and of both cells [mm].
+    0 if unknown: for other than square stacking, under shear or lateral strain, at sides that
+    aren't free. ``mesh_size``: edge length of the elements of the RVE and of both cells [mm].
     """
     if specimen.stacking != "square" or loading.shear or loading.lateral:
         return 0.0, 0.0
@@ -51,12 +51,12 @@ def edge_shifts(
 def _plate_force(
     specimen: Specimen, material: Material, mesh_size: float, plates: str, sides: str
 ) -> float:
-    """On each plate of a specimen at rest, per unit of nominal strain [N/mm]."""
+    """Force on each plate of a specimen at rest, per unit of nominal strain [N/mm]."""
     mesh, (a, b) = mesh_specimen(specimen, mesh_size), specimen.half_size
     x, y = mesh.nodes.T
     at_plates, at_sides = np.isclose(np.abs(x), a), np.isclose(np.abs(y), b)
     fixed = at_plates & (plates == "clamped") | at_sides & (sides == "guided")
-    fixed[np.argmin(np.hypot(x + a, y))] = True  # on a mirror line: u_y = 0 in any case
+    fixed[np.argmin(np.hypot(x + a, y))] = True  # on a mirror line, where u_y = 0 anyway
     free = np.flatnonzero(~np.stack([at_plates, fixed], axis=1))
     u = np.stack([np.where(at_plates, -0.5 * specimen.length * np.sign(x), 0.0), 0.0 * y], axis=1)
     K, u = FreeBody(mesh, material).stiffness(0.0 * u), u.ravel()

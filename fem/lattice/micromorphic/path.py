@@ -1,9 +1,9 @@
 """Equilibria of a homogenized body: primary path, stability, critical point.
 
-Newton's method goes for both scales at once; RVEs start from their own last states, carried
-along with F̄, v and g by cubics. Stability is by the inertia of L D L^T factors: of all RVEs at
-fixed strains and of the body's condensed stiffness (their sum, Haynsworth, Linear Algebra Appl. 1
-(1968) 73-81), and of the block of v alone, which no soft mode of u can hide.
+Newton's method solves both scales at once. The RVEs' initial guesses are extrapolated from their
+last states, with F̄, v and g, by cubics. Stability follows from the inertia of L D L^T factors: of
+all RVEs at fixed strains and of the body's condensed stiffness (the sum of both, Haynsworth, Linear
+Algebra Appl. 1 (1968) 73-81), and of the block of v alone, where modes of u don't matter.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _ITERATIONS = 8
-# What a change of the load by this makes: forces that one more Newton step turns into nothing, so
-# that its linearisation, by 1e-7 off, serves for moduli and inertia.
+# Tolerance: forces of a change of the load by this. One more Newton step removes them, and its
+# linearisation, with an error of 1e-7, is used for moduli and inertia.
 _SMALL = 1e-7
 _DENSE = 1000  # unknowns up to which all eigenvalues are computed
-_FEW = 6  # eigenvalues otherwise
-_ALIKE = 1e-6  # critical modes have eigenvalues that far from the lowest one's [-]
-# Or, where a mesh splits a set of several patterns, that share of those at rest, and one shape of
-# v over the body, which has that share of their square.
+_FEW = 6  # number of eigenvalues computed otherwise
+_ALIKE = 1e-6  # critical modes have eigenvalues within this of the lowest one [-]
+# Or, if a mesh splits a degenerate set of patterns: eigenvalues below this share of those at rest,
+# and a common shape of v over the body that has this share of their square.
 _SPLIT, _SHARED = 3e-2, 0.8
 _NONE: FloatArray = np.zeros((0, 0))
-_SOME = 0.01  # of u: what a mode has at least of the pattern, if that is what becomes unstable
+_SOME = 0.01  # least ratio of pattern to u in a mode for which the pattern becomes unstable
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,25 +43,25 @@ class HomogenizedState:
     """An equilibrium of both scales."""
 
     load: float
-    """e, such as the nominal strain [-]."""
+    """Load e, such as the nominal strain [-]."""
     force: float
-    """dE/de over L and the thickness: of a compression the force on a plate [N/mm]."""
+    """dE/de over L: for a compression the force on a plate per unit thickness [N/mm]."""
     energy: float
-    """E, stored energy by thickness [N]."""
+    """E, stored energy per unit thickness [N]."""
     displacement: FloatArray
     amplitudes: FloatArray
-    """(n, 2) u [mm] and (n, m) v_i of the mesh's nodes, NaN where there is no lattice."""
+    """(n, 2) u [mm] and (n, m) v_i of the mesh's nodes; v_i is NaN outside the lattice."""
     strains: FloatArray
     stresses: FloatArray
-    """(p, 4 + 3 m) F̄, v, g and P̄, Pi, Lambda at the points of the lattice."""
+    """(p, 4 + 3 m) strains F̄, v, g and stresses P̄, Pi, Lambda at the points of the lattice."""
     negative_eigenvalues: int
-    """Of the tangent of both scales together; 0: stable."""
+    """Number of negative eigenvalues of the tangent of both scales together; 0: stable."""
     rve_negative: int
     pattern_negative: int
-    """Those of the RVEs alone at fixed F̄, v, g; those of the condensed stiffness of v alone."""
+    """Number for the RVEs alone at fixed F̄, v, g; for the condensed stiffness of v alone."""
     value: FloatArray = field(repr=False)
     rate: FloatArray = field(repr=False)
-    """y, then w of this rank's RVEs; their derivatives by the load."""
+    """y followed by w of this rank's RVEs, and their derivatives by the load."""
     branch: str = "primary"
 
 
@@ -70,24 +70,24 @@ class HomogenizedCritical:
     """The first critical point of a primary path."""
 
     load: float
-    """[-]."""
+    """Critical load [-]."""
     kind: str
-    """What becomes unstable: "pattern" (a mode with v), "displacement" (of u alone), "RVE" (a
+    """Kind of instability: "pattern" (a mode with v), "displacement" (of u alone), "RVE" (a
     fluctuation that no given mode describes; without modes, the pattern itself)."""
     state: HomogenizedState
-    """Just before."""
+    """The state just before."""
     modes: FloatArray
-    """(k, free unknowns) critical modes of the body, the largest displacement of the pattern 1 mm;
-    none of an "RVE"."""
+    """(k, free unknowns) critical modes of the body, scaled to a largest displacement of the
+    pattern (of u for "displacement") of 1 mm; none for "RVE"."""
     negative_before: int
     negative_after: int
-    """Negative eigenvalues at either side, ``tolerance`` away: the proof."""
+    """Negative eigenvalues ``critical_tolerance`` before and after: the proof."""
 
 
 class HomogenizedPath:
-    """Equilibria of one body; the linearisation at the last one serves what is next.
+    """Equilibria of one body; the linearisation at the last one is reused for the next.
 
-    ``linearisations`` counts those of the whole body: each factorises every RVE once.
+    ``linearisations`` counts linearisations of the body; each factorises every RVE once.
     """
 
     def __init__(self, body: HomogenizedBody, options: PathOptions | None = None) -> None:
@@ -95,14 +95,14 @@ class HomogenizedPath:
         self.linearisations = 0
         vectors = body.rves[0].cell.cell.lattice
         self.pitch = 0.5 * float(np.linalg.norm(vectors, axis=1).min())
-        """Half the RVE's shorter vector, what a branch's amplitudes refer to [mm]."""
+        """Half the RVE's shorter vector, to which a branch's amplitudes refer [mm]."""
         start = self.equilibrium(0.0, body.start)
         if start is None or start.negative_eigenvalues:
             what = "homogenized body: expected one that is stable without load, got one that isn't"
             raise InputError(f"{what}; check material and mesh, or take more points")
         self.states = [start]
-        """The primary path."""
-        # A metric that makes eigenvalues of u and v comparable numbers.
+        """States of the primary path."""
+        # A metric that makes eigenvalues of u and v comparable.
         self._at_rest = self.last.stiffness
         self.scale = np.abs(self._at_rest.diagonal())
 
@@ -110,7 +110,7 @@ class HomogenizedPath:
         self, load: float, guess: FloatArray, weights: FloatArray | None = None,
         amplitude: float = 0.0, branch: str = "primary",
     ) -> HomogenizedState | None:  # fmt: skip
-        """The equilibrium near a guess at a load, or where weights . y = amplitude; or None."""
+        """The equilibrium near a guess, at a load or with weights . y = amplitude; None if lost."""
         value, count = guess, self.body.free_count
         for _ in range(_ITERATIONS):
             at = LinearisedBody(self.body, load, value)
@@ -134,9 +134,9 @@ class HomogenizedPath:
     def _settled(
         self, load: float, value: FloatArray, dy: FloatArray, branch: str
     ) -> HomogenizedState | None:
-        """The state that a last, small step from a linearisation leads to.
+        """The state after a last, small step from the linearisation.
 
-        None where an element of an RVE is turned inside out.
+        None if an element of an RVE is inverted.
         """
         at, body = self.last, self.body
         areas = [region.at.weights.ravel() for region in self.body.regions]
@@ -168,11 +168,11 @@ class HomogenizedPath:
         )  # fmt: skip
 
     def follow_primary(self, load: float, block: str = "") -> bool:
-        """Extend ``states`` to a load, or to the first state where a block is unstable.
+        """Extend ``states`` to a load, or to the first state at which a block is unstable.
 
-        False where no step, down to 1e-5, converges.
+        False if no step, down to 1e-5, converges.
 
-        block : "all", or "pattern" for v alone; by default stability doesn't matter.
+        block : "all", or "pattern" for v alone; by default stability is ignored.
         """
         step = self.options.first_step
         while (here := self.states[-1]).load < load - 1e-12 and not is_unstable(here, block):
@@ -189,17 +189,17 @@ class HomogenizedPath:
         return True
 
     def critical(self, block: str = "all") -> HomogenizedCritical | None:
-        """The critical point between the last two of ``states``; None if it gets lost.
+        """The critical point between the last two of ``states``; None if it can't be located.
 
-        Its load is where the block's lowest eigenvalue passes zero, or where the number of negative
-        ones of the RVEs changes, proved by the inertia at both sides.
+        There the block's lowest eigenvalue passes zero, or the number of negative eigenvalues of
+        the RVEs changes; the inertia on both sides is the proof.
         """
         tolerance, ends = self.options.critical_tolerance, self.states[-2:]
         known, calm = {state.load: state for state in ends}, ends[0].rve_negative
 
         def at(load: float) -> HomogenizedState:
-            # Not from states so near to a singular one that rounding moves their v, nor two so near
-            # to each other.
+            # Extrapolate only from states that are not so close to the singular one that rounding
+            # changes their v, and not that close to each other.
             far, near = 100 * tolerance, list[float]()
             for e in sorted(known, key=lambda e: abs(e - load)):
                 if e == load or all(abs(e - other) > far for other in (load, *near)):
@@ -217,7 +217,7 @@ class HomogenizedPath:
                 return -1.0 if state.rve_negative > calm else 1.0
             return float(self._eigenpairs(part)[0][0])
 
-        # The block of v alone first: its eigenvalue is smooth where modes of u are lower.
+        # First the block of v alone: its eigenvalue is smooth even if modes of u are lower.
         parts = ["pattern", block] if ends[1].pattern_negative else [block]
         if block == "all" and ends[1].rve_negative > calm:
             parts = ["RVE", *parts]
@@ -233,12 +233,12 @@ class HomogenizedPath:
                 modes, kind = self._critical_modes(block) if part != "RVE" else (_NONE, part)
                 counts = before.negative_eigenvalues, after.negative_eigenvalues
                 return HomogenizedCritical(load, kind, before, modes, *counts)
-            if part == "RVE":  # the whole is unstable before
+            if part == "RVE":  # the whole body becomes unstable earlier
                 between[1] = before.load
         return None
 
     def _critical_modes(self, block: str) -> tuple[FloatArray, str]:
-        """(k, free unknowns) modes of the last state that belong together, and of what kind."""
+        """(k, free unknowns) set of critical modes of the last state, and its kind."""
         values, vectors = self._eigenpairs(block)
         count = int(np.sum(np.abs(values - values[0]) < _ALIKE))
         falls = values < _SPLIT * np.sum(vectors * (self._at_rest @ vectors), axis=0)
@@ -252,7 +252,7 @@ class HomogenizedPath:
         return modes / peaks[:, [int(kind != "pattern")]], kind
 
     def _eigenpairs(self, block: str) -> tuple[FloatArray, FloatArray]:
-        """Eigenvalues [-], ascending, and vectors of the stiffness of y at the last state."""
+        """Eigenvalues [-], ascending, and eigenvectors of y's stiffness at the last state."""
         chosen = np.flatnonzero(self.body.is_pattern | (block == "all"))
         root = 1.0 / np.sqrt(self.scale[chosen])
         K = self.last.stiffness[chosen][:, chosen] * root[:, None] * root
@@ -266,7 +266,7 @@ class HomogenizedPath:
         return values[order], vectors
 
     def largest(self, mode: FloatArray) -> tuple[float, float]:
-        """The largest displacement by the pattern, sum |v_i| max |phi_i|, and that of u [mm]."""
+        """Largest displacement of the pattern, sum |v_i| max |phi_i|, and of u [mm]."""
         u, v = self.body.fields(self.body.T @ mode)
         peaks = np.linalg.norm(self.body.rves[0].shapes, axis=2).max(axis=1)
         pattern = np.nan_to_num(np.abs(v)) @ peaks
@@ -274,7 +274,7 @@ class HomogenizedPath:
 
 
 def _expected(states: Sequence[HomogenizedState], load: float) -> FloatArray:
-    """The state at a load by the tangent of the last state, or the cubic of the last two."""
+    """State extrapolated to a load by the last state's tangent, or the last two's cubic."""
     return np.asarray(extrapolate([(s.load, s.value, s.rate) for s in states[-2:]], load))
 
 

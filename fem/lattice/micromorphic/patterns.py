@@ -1,7 +1,7 @@
-"""Patterning modes phi as homogenization takes them: sums of plane waves, snapped to a lattice.
+"""Patterning modes phi for homogenization: sums of plane waves, snapped to a lattice.
 
-Any function of points (n, 2) [mm] with values (n, 2) [-] serves as a mode, and so do nodal values
-on a cell. Positions are those of the lattice that the cell is cut from. Plain numpy.
+Any function of points (n, 2) [mm] with values (n, 2) [-] can be a mode, and so can nodal values on
+a cell. Positions are in the coordinates of the lattice that the cell is part of. Plain numpy.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 ModeField = Callable[[FloatArray], FloatArray] | FloatArray
-"""phi(X): a function of points, or values (n, 2) at the nodes of the cell it is given with."""
+"""phi(X): a function of points, or values (n, 2) at the nodes of the corresponding cell."""
 
-_SNAP = 0.1  # of a wave vector's length: the most by which it is changed
+_SNAP = 0.1  # largest change of a wave vector, over its length
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +42,9 @@ class PlaneWaves:
 
     @classmethod
     def of_sines(cls, waves: ArrayLike, half_wavelength: float, scale: float = 1.0) -> PlaneWaves:
-        """From (w, 5) A, B, kx, ky [-], c [mm]: s sum (A, B) sin(pi/l (kx x + ky y + c)).
+        """From rows A, B, kx, ky [-], c [mm] (w, 5): s sum (A, B) sin(pi/l (kx x + ky y + c)).
 
-        ``half_wavelength`` is l [mm], ``scale`` s [-]: the paper's Eq. (mode) and its families.
+        ``half_wavelength`` is l [mm], ``scale`` is s [-]. This is Eq. (mode) and its families.
         """
         values, per_mm = np.atleast_2d(np.asarray(waves, np.float64)), np.pi / half_wavelength
         if values.ndim != 2 or values.shape[1] != 5:
@@ -58,21 +58,21 @@ class PlaneWaves:
         return np.asarray(np.cos(angle) @ self.cosine + np.sin(angle) @ self.sine)
 
     def moved(self, by: ArrayLike) -> PlaneWaves:
-        """phi(X - by), the same pattern elsewhere [mm]."""
+        """phi(X - by), the pattern translated by ``by`` (2,) [mm]."""
         return self._turned(-self.vectors @ np.asarray(by, np.float64))
 
     def _turned(self, angle: FloatArray) -> PlaneWaves:
-        """Every wave's phase k . X increased by an angle (w,) [rad]."""
+        """The waves with their phases k . X increased by ``angle`` (w,) [rad]."""
         c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
         cosine, sine = c * self.cosine + s * self.sine, c * self.sine - s * self.cosine
         return replace(self, cosine=cosine, sine=sine)
 
 
 def rotation_pattern(pitch: float, pitch_y: float | None = None) -> PlaneWaves:
-    """The paper's Eq. (mode) of square or rectangular stacking, max |phi| = 1.
+    """The paper's Eq. (mode) for square or rectangular stacking, max |phi| = 1.
 
-    phi = (sin x cos y, -cos x sin y), x and y times pi/l and pi/l_y, with the origin at the centre
-    of a hole: holes turn into ellipses, neighbours at right angles.
+    phi = (sin x cos y, -cos x sin y), x and y in units of l/pi and l_y/pi, with the origin at the
+    centre of a hole: holes become ellipses, neighbours at right angles.
     """
     kx, ky = np.pi / pitch, np.pi / (pitch if pitch_y is None else pitch_y)
     vectors, sine = [[kx, ky], [kx, -ky]], [[0.5, -0.5], [0.5, 0.5]]
@@ -83,15 +83,15 @@ def snapped(
     mode: PlaneWaves, lattice: ArrayLike, about: ArrayLike = (0.0, 0.0),
     inversion_centre: ArrayLike | None = None,
 ) -> PlaneWaves:  # fmt: skip
-    """The mode with the wave vectors nearest to its own that repeat on a cell.
+    """The mode with its wave vectors replaced by the nearest ones that are periodic on a cell.
 
-    A percent of a wave number makes ten of the critical strain, so a measured mode needs this. An
-    InputError refuses wave vectors that would change by more than a tenth, or vanish.
+    An error of 1 % in a wave number changes the critical strain by 10 %, so measured modes need
+    this. InputError for wave vectors that would change by more than a tenth, or vanish.
 
     lattice : vectors of the cell as rows (2, 2) [mm].
-    about : the point at which phases are kept, such as the middle of what was measured [mm].
+    about : the point at which phases are kept, such as the centre of the measured region [mm].
     inversion_centre : if given, phases are snapped too: phi is made odd or even about this point
-        of the lattice, whichever it is more, and every wave keeps its amplitudes.
+        of the lattice, whichever is nearer, and every wave keeps its amplitudes.
     """
     vectors = np.asarray(lattice, dtype=np.float64)
     turns = np.rint(mode.vectors @ vectors.T / (2.0 * np.pi))

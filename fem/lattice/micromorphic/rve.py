@@ -2,8 +2,8 @@
 
     u(X) = (F̄ - I) X + sum_i (v_i + g_i . X) phi_i(X) + w(X),    X from the RVE's centre,
 
-with w periodic, <w> = 0, <w . phi_i> = 0, <(w . phi_i) X> = 0 over the material, so that w has
-nothing of what F̄, v and g say. With the energy W(F̄, v, g) per area |Q|, holes included,
+with w periodic, <w> = 0, <w . phi_i> = 0, <(w . phi_i) X> = 0 over the material, so that w is
+independent of F̄, v and g. With the energy W(F̄, v, g) per area |Q|, including holes,
 
     P̄ = dW/dF̄ = <P>,   Pi_i = dW/dv_i = <P : grad phi_i>,
     Lambda_i = dW/dg_i = <P^T phi_i + X (P : grad phi_i)>   (<.> times the material over |Q|).
@@ -32,13 +32,13 @@ from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
 NORMALISATIONS = ("rms", "largest", "given")
-"""The mean of phi . phi over the material is 1; max |phi| at nodes is 1; phi as it is given."""
-_PERIODIC = 1e-6  # of max |phi|: by how much partner nodes may differ
+"""The mean of phi . phi over the material is 1; max |phi| at nodes is 1; phi unchanged."""
+_PERIODIC = 1e-6  # largest difference between partner nodes, over max |phi|
 _DEPENDENT = 1e-6  # least singular value of normalised modes
 _GOLDEN = 0.5 * (3.0 - math.sqrt(5.0))
 _ITERATIONS = 12
-_SMALL = 1e-10  # of the forces that a unit of F̄ makes, before one more step
-_SHORTEST = 1e-4  # of the way to given strains: the smallest step
+_SMALL = 1e-10  # tolerance, over the forces of a unit of F̄, before one more step
+_SHORTEST = 1e-4  # smallest step, as a fraction of the way to given strains
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +47,30 @@ class RVEState:
 
     strains: FloatArray
     stresses: FloatArray
-    """(4 + 3 m,) F̄, v, g and P̄, Pi, Lambda."""
+    """(4 + 3 m,) strains F̄, v, g and stresses P̄, Pi, Lambda."""
     moduli: FloatArray
     """(4 + 3 m, 4 + 3 m) derivatives of the stresses by the strains, w in equilibrium."""
     energy: float
-    """Per area of the cell, holes included [MPa]."""
+    """Stored energy per area of the cell, including holes [MPa]."""
     fluctuation: FloatArray
     """(n, 2) w at the nodes of the cell [mm], <w> = 0."""
     negative_eigenvalues: int
-    """Of the tangent in w at fixed strains; 0: stable."""
+    """Number of negative eigenvalues of the tangent in w at fixed strains; 0: stable."""
 
 
 class RVE:
-    """One RVE, which serves at all points of a continuum: kinematics, stresses, moduli.
+    """An RVE, used at all points of a continuum: kinematics, stresses, moduli.
 
-    An InputError refuses modes without the cell's period, linearly dependent or zero ones, and
-    cells that don't tile the lattice.
+    InputError for modes without the cell's period, linearly dependent or zero modes, and cells
+    that don't tile the lattice.
 
-    cell : with the period of the modes, such as ``square(...).enlarged(2, 2)``.
+    cell : unit cell with the period of the modes, such as ``square(...).enlarged(2, 2)``.
     modes : fields in the cell's coordinates, or values at its nodes (n, 2). Their means over the
-        material, translations, are taken out.
-    centre : point of the lattice from which X is measured [mm]. The cell is cut anew about it (what
-        is nearer to it than to its copies), and how matters: a junction or a hole's centre.
-    normalisation : of the modes, among ``NORMALISATIONS``; v_i are in mm over it. ``scales`` (m,)
-        are what ``modes``, as they were given, were multiplied by.
+        material, which are translations, are subtracted.
+    centre : point of the lattice from which X is measured [mm]. The cell is recut about it (the
+        region nearer to it than to its copies); results depend on it: a junction or a hole.
+    normalisation : of the modes, among ``NORMALISATIONS``, which sets the unit of v_i [mm].
+        ``scales`` (m,): the factors by which the given ``modes`` were multiplied.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class RVE:
         along = (shapes[:, None] * X.T[None, :, :, None]).reshape(-1, len(X), 2)
         patterns = np.concatenate([shapes, along]).reshape(3 * len(modes), X.size)
         self.carriers = np.column_stack([self.cell.affine, patterns.T])
-        """(2 n, 4 + 3 m) nodal displacements [mm] of generalised strains of 1."""
+        """(2 n, 4 + 3 m) nodal displacements due to unit generalised strains [mm]."""
         self._constraints = self._independent()
 
     @property
@@ -103,12 +103,12 @@ class RVE:
         return np.concatenate([np.eye(2).ravel(), np.zeros(3 * self.mode_count)])
 
     def displacement(self, strains: FloatArray, fluctuation: FloatArray) -> FloatArray:
-        """(n, 2) of the nodes of ``cell`` [mm], with <w> = 0."""
+        """(n, 2) displacement of the nodes of ``cell`` [mm], with <w> = 0."""
         w = self.cell.reduction.displacement(fluctuation)
         return np.asarray(self._carried(strains) + w - self._mean(w))
 
     def condensed(self, strains: FloatArray, fluctuation: FloatArray) -> CondensedCell:
-        """The equations at strains q (4 + 3 m,) and w (2 count,) of the masters, w condensed."""
+        """The equations at strains q (4 + 3 m,) and masters' w (2 count,), with w condensed."""
         violation = self._constraints @ fluctuation[self.cell.free_dofs]
         u = self._carried(strains) + self.cell.reduction.displacement(fluctuation)
         return CondensedCell(self.cell, self.carriers, u, self._constraints, violation)
@@ -116,7 +116,7 @@ class RVE:
     def equilibrium(self, strains: ArrayLike, fluctuation: FloatArray | None = None) -> RVEState:
         """The state at strains q (4 + 3 m,), from a guess of w (n, 2) at the nodes, or in steps.
 
-        The steps go straight from the undeformed state; an InputError says how far they came.
+        Steps go straight from the undeformed state; if one fails, InputError tells how far it got.
         """
         q, rest = np.asarray(strains, np.float64), self.at_rest
         if q.shape != rest.shape or not np.isfinite(q).all():
@@ -155,16 +155,16 @@ class RVE:
 
     @property
     def averages(self) -> FloatArray:
-        """(2 + 3 m, n, 2) weights of a nodal w, whose sums over the nodes are averages over |Q|.
+        """(2 + 3 m, n, 2) weights of nodal w whose weighted sums are averages over |Q|.
 
-        <w>, then <w . phi_i>, then <(w . phi_i) X>, the last two of w - <w>: no translation counts.
+        <w>, <w . phi_i> and <(w . phi_i) X>; the last two of w - <w>, independent of translations.
         """
         along = np.tile(np.eye(2), len(self.cell.cell.mesh.nodes))
         weights = np.concatenate([(self._mass @ along.T).T, self._weights().T])
         return np.asarray(weights.reshape(len(weights), -1, 2) / self.area)
 
     def energy(self, strains: FloatArray, fluctuation: FloatArray) -> float:
-        """Stored energy per area of the cell, holes included [MPa]."""
+        """Stored energy per area of the cell, including holes [MPa]."""
         return self.cell.body.energy(self.displacement(strains, fluctuation)) / self.area
 
     def _carried(self, strains: FloatArray) -> FloatArray:
@@ -176,7 +176,7 @@ class RVE:
         return np.asarray((weights * fields).sum(axis=-2, keepdims=True) / weights.sum(axis=0))
 
     def _normalised(self, fields: FloatArray, how: str) -> tuple[FloatArray, FloatArray]:
-        """Modes of mean 0 with their scales."""
+        """Normalised modes of mean 0, and their scales (m,)."""
         largest = np.linalg.norm(fields, axis=2).max(axis=1, initial=0.0)
         fields = fields - self._mean(fields)
         flat = fields.reshape(len(fields), self._mass.shape[0])
@@ -195,14 +195,14 @@ class RVE:
     def _weights(self) -> FloatArray:
         """(2 n, 3 m) weights of nodal w in <w . phi_i> and <(w . phi_i) X>.
 
-        They have mean 0, and so are the same for any translation of w.
+        They have mean 0, so that the results don't change with a translation of w.
         """
         fields = self.carriers[:, 4:].T.reshape(-1, *self.cell.cell.mesh.nodes.shape)
         free = (fields - self._mean(fields)).reshape(-1, len(self.carriers))
         return np.asarray(self._mass @ free.T)
 
     def _independent(self) -> FloatArray:
-        """(3 m, free) orthonormal rows C: C w = 0 is what w has to satisfy; <w> = 0 need not be."""
+        """(3 m, free) orthonormal rows C of the constraints C w = 0; <w> = 0 isn't required."""
         reduced = self.cell.reduction.restricted(self._weights())
         rows, size = np.linalg.qr(reduced[self.cell.free_dofs])
         diagonal = np.abs(np.diag(size))
@@ -213,10 +213,10 @@ class RVE:
 
 
 def spread_positions(count: int) -> FloatArray:
-    """(count, 2) places in a cell, from its middle and in its vectors, whose mean is the cell's.
+    """(count, 2) positions in a cell, relative to its centre, in fractions of its vectors.
 
-    A lattice rule (Sloan & Joe, 1994): all differ evenly along either vector, and they are
-    symmetric about the middle, so that no position alone makes v grow.
+    A lattice rule (Sloan & Joe, 1994): positions are evenly spaced along both vectors and symmetric
+    about the centre (mean 0), so that the positions don't favour a growth of v.
     """
     turn = min((n for n in range(1, count + 1) if math.gcd(n, count) == 1),
                key=lambda n: abs(n - _GOLDEN * count))  # fmt: skip
@@ -225,15 +225,15 @@ def spread_positions(count: int) -> FloatArray:
 
 
 def centred_cell(cell: UnitCell, centre: FloatArray) -> tuple[UnitCell, IntArray]:
-    """The same lattice cut about a point, which becomes the origin, and each node's original.
+    """The cell of the same lattice around a point, the new origin; and each node's original number.
 
-    Elements go whole to the copy of the centre that their own centre is nearest to.
+    Each element belongs to the copy of ``centre`` that is nearest to the element's centre.
     """
     mesh, vectors, old = cell.mesh, cell.lattice, cell.periodicity
     steps = np.array(list(product(range(-3, 4), repeat=2)))
     middles = mesh.nodes[mesh.cells[:, :3]].mean(axis=1) - centre
     copies = middles[:, None] + steps @ vectors
-    # Ties are settled alike everywhere: those on a side belong to the right and the upper one.
+    # Ties are resolved consistently: elements on a side belong to the right and the upper cell.
     tilt = 1e-7 * np.linalg.norm(vectors, axis=1).max() * np.array([1.0, 0.7])
     shift = steps[np.argmin(np.linalg.norm(copies + tilt, axis=2), axis=1)]
     keys = np.dstack([old.master[mesh.cells], old.shift[mesh.cells] + shift[:, None]])
