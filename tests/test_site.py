@@ -184,4 +184,4 @@ def test_no_equation_has_a_command_that_nothing_has_drawn(site: Path) -> None:
 def test_options_keep_both_dashes_and_attributes_their_texts(site: Path) -> None:
     assert "–out" not in (site / "generated/command_line.html").read_text("utf-8")
     text = (site / "generated/api/modeharvest.idic.html").read_text("utf-8")
-    assert "Of a slow field: 231 unknowns" in text
+    assert "231 unknowns per field" in text
