@@ -286,7 +286,7 @@ def test_the_commands_print_a_short_table(
     text = capsys.readouterr().out
     assert "Critical strain 1.1" in text
     assert "k·a = (π, π)" in text
-    assert "below: 0, above: 1" in text
+    assert "load: 0, above: 1" in text
     assert "mode φ₁" in text
     assert str(folder / "report.html") in text.replace("\n", "")
 
