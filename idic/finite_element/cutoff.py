@@ -1,35 +1,35 @@
 """The cut-off wavelength of the regularisation with the least estimated risk; standard deviations.
 
-Near a solution the displacement is linear in the images' noise, so that for any weight lambda of
-the smoothness R the residual's sum of squares Q and the effective number of unknowns t = tr A^-1 M,
-A = M + lambda R, follow from one factorisation; t by random probes (M. F. Hutchinson, Commun.
-Stat. Simul. Comput. 19 (1990), doi 10.1080/03610919008812866). The weight taken minimises
+Near a solution the displacement is linear in the images' noise. For any weight lambda of the
+smoothness R, one factorisation of A = M + lambda R therefore gives the residual's sum of squares Q
+and the effective number of unknowns t = tr A^-1 M, by random probes (M. F. Hutchinson, Commun.
+Stat. Simul. Comput. 19 (1990), doi 10.1080/03610919008812866). The chosen weight minimises
 
     Q/(1 - 1.4 c t/p)^2,
 
 generalised cross-validation with p pixels (G. Golub, M. Heath, G. Wahba, Technometrics 21 (1979),
-doi 10.1080/00401706.1979.10489751): without the 1.4, but for a constant, an unbiased estimate of
-the error that is left in g(x + u). The 1.4 keeps it from smoothing too little, which costs more
-than smoothing too much: Y.-J. Kim, C. Gu, J. R. Stat. Soc. B 66 (2004), doi
-10.1046/j.1369-7412.2003.05316.x. c is what the noise has at the long wavelengths of which
-displacements are made, over its variance at the pixels: interpolated noise is smoother than that of
-the pixels.
+doi 10.1080/00401706.1979.10489751). Without the 1.4 it is, but for a constant, an unbiased estimate
+of the remaining error in g(x + u). The 1.4 prevents too little smoothing, which costs more than too
+much: Y.-J. Kim, C. Gu, J. R. Stat. Soc. B 66 (2004), doi
+10.1046/j.1369-7412.2003.05316.x. c is the noise's power at the long wavelengths of displacements
+over its variance at the pixels: interpolated noise is smoother than that of the pixels.
 
-The covariance by noise is A^-1 C A^-1, C that of the gradient: s_f^2 h_0 h_0' + s_g^2 h h'/det F
-summed over the pixels, h_0 being h without its noise (see ``solver.weighting``). What smoothing
-takes away is estimated by what a weight four times as large changes, in the mean square around each
-node. Where there is no speckle nothing changes that, and the smoothest displacement shows no noise:
-there it counts what the regularisation lets a displacement do, s^2 lambda A^-1 R A^-1 (G. Wahba, J.
-R. Stat. Soc. B 45 (1983), doi 10.1111/j.2517-6161.1983.tb01239.x), by how much of the slopes around
-a node is noise. With a material law a larger weight says little, because errors of a law are the
-same at all long wavelengths. There the truth is taken to be at most as far from the solution with
-the law as that without it is, d, and most probably with it, which adds the variance d^2/6 of a
-triangular distribution (Guide to the Expression of Uncertainty in Measurement, JCGM 100, 4.3.9).
+The covariance by noise is A^-1 C A^-1. C, the gradient's covariance, is the sum over the pixels of
+s_f^2 h_0 h_0' + s_g^2 h h'/det F, h_0 being h without its noise (see ``solver.weighting``). The
+bias by smoothing is estimated from the change of u under a weight four times as large, as mean
+square around each node. Without speckle a larger weight changes nothing, and the smoothest
+displacement has no noise. There the covariance that the regularisation allows is added,
+s^2 lambda A^-1 R A^-1 (G. Wahba, J. R. Stat. Soc. B 45 (1983), doi
+10.1111/j.2517-6161.1983.tb01239.x), times the share of noise in the slopes around a node. With a
+material law a larger weight says little, because a law's errors are the same at all long
+wavelengths. The true u is then taken to be at most d from the solution with the law, d being its
+distance to the one without, and most probably at it: a triangular distribution of variance d^2/6
+(Guide to the Expression of Uncertainty in Measurement, JCGM 100, 4.3.9).
 
-Smoothing takes A^-1 lambda R(u - u_0) from the true displacement u. That of the measured one is put
-back where it stands out from noise and the elements' own error: J. Tukey's twicing, a second step
-of iterated Tikhonov regularisation, at the few places, tips of holes first of all, that are rougher
-than the cut-off wavelength was found for.
+Smoothing takes A^-1 lambda R(u - u_0) from the true displacement u. The same term of the measured u
+is added back where it exceeds noise and the elements' interpolation error: J. Tukey's twicing, a
+second step of iterated Tikhonov regularisation. This concerns few places, mainly tips of holes,
+that are rougher than the displacement for which the cut-off wavelength was found.
 """
 
 from __future__ import annotations
@@ -46,36 +46,36 @@ from modeharvest.util.arrays import FloatArray, IntArray
 
 _PROBES, _DEGREES = 4, 1.4
 _STEP = 1.4
-"""Between neighbouring cut-off wavelengths."""
+"""Ratio of neighbouring cut-off wavelengths in the search."""
 _TINY = float(np.finfo(np.float64).tiny)
 _LEAST_PX, _MOST_PX = 10.0, 400.0
-"""Shorter ones leave single nodes to what splines make of edges."""
+"""Bounds of the search; shorter ones expose nodes to errors of image splines at edges."""
 _STRONGER = 4.0
 """Weight of the regularisation that shows its bias, over the weight used [-]."""
 _OF_SLOPES = 2.0
-"""Bias of gradients over what that shows: waves that are gone (half, in k^-3.5) can't change."""
+"""Bias of gradients over its estimate: waves already lost (half, for k^-3.5) can't change."""
 _SIGNIFICANT = 3.0
-"""Standard deviations."""
+"""A difference of more standard deviations is significant."""
 _STANDS_OUT = 6.0
-"""Square of what smoothing takes over its variance, around a node."""
+"""Square of the part removed by smoothing over its variance, above which it is put back [-]."""
 
 
 @dataclass(frozen=True)
 class Risk:
-    """What a cut-off wavelength is expected to cost."""
+    """Estimated error for a cut-off wavelength."""
 
     cutoff_px: float
     """Cut-off wavelength [px]."""
     value: float
-    """Generalised cross-validation [grey levels^2]."""
+    """Generalised cross-validation score per pixel [grey levels^2]."""
     unknowns: float
-    """Their effective number t."""
+    """Effective number of unknowns t."""
     noise: float
     """Estimated standard deviation of the residual's noise [grey levels]."""
 
 
 def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> Risk:
-    """Estimate the risk of one cut-off wavelength; ``excess`` is c."""
+    """Estimate the risk of one cut-off wavelength; ``excess`` is c of the module's text."""
     weight = at.weight(cutoff_px * pixel_size)
     z = np.random.default_rng(0).choice([-1.0, 1.0], (at.u.size, _PROBES))
     found = at.factor(weight).solve(np.column_stack([at.right(weight), at.M @ z]))
@@ -90,7 +90,7 @@ def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> 
 def least_risk(
     at: Linearised, first_px: float, pixel_size: float, excess: float
 ) -> tuple[Risk, ...]:
-    """Try cut-off wavelengths from one on until the risk rises on both sides; ascending."""
+    """Try cut-offs from ``first_px`` until the risk rises on both sides; in ascending order."""
     tried = {0: risk(at, first_px, pixel_size, excess)}
     while True:
         best = min(tried, key=lambda k: tried[k].value)
@@ -102,7 +102,7 @@ def least_risk(
 
 
 def best_of(tried: tuple[Risk, ...]) -> float:
-    """The cut-off wavelength at the vertex of the parabola through the best three [px]."""
+    """Cut-off wavelength at the vertex of the parabola through the three lowest risks [px]."""
     k = min(range(len(tried)), key=lambda i: tried[i].value)
     if not 0 < k < len(tried) - 1:
         return max(tried[k].cutoff_px, _LEAST_PX)
@@ -115,32 +115,32 @@ class Deviations(NamedTuple):
     """Standard deviations of u and of its gradient."""
 
     samples: FloatArray
-    """(n, 2, s) what random noise makes of u [mm]."""
+    """(n, 2, s) random errors of u by noise [mm]."""
     lost: FloatArray
-    """(n, 2, s) random displacements, of any size, like those that smoothing takes away [mm]."""
+    """(n, 2, s) random displacements of the kind smoothing removes, of arbitrary size [mm]."""
     changes: FloatArray
-    """(n, 2, k) what smoothing, or no law, may change u by [mm]."""
+    """(n, 2, k) possible changes of u, by smoothing or by leaving out the law [mm]."""
     bias: FloatArray
-    """(n, 2) of u by that, and by the elements' own error [mm]."""
+    """(n, 2) standard deviation of u by these and by the elements' interpolation error [mm]."""
     gradient: FloatArray
-    """(n, 4, 4) covariance by both of xx, xy, yx, yy of grad u [-]."""
+    """(n, 4, 4) covariance of xx, xy, yx, yy of grad u, by noise and bias [-]."""
     taken: FloatArray | float = 0.0
-    """(n, 2) what smoothing has taken from u, where that stands out [mm]."""
+    """(n, 2) part of u removed by smoothing, where it is significant, else 0; to be added [mm]."""
 
     @property
     def by_noise(self) -> FloatArray:
-        """(n, 2) of u [mm]."""
+        """(n, 2) standard deviation of u by noise [mm]."""
         return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
 
     @property
     def roots(self) -> FloatArray:
-        """(n, 2, s + k) vectors whose outer products sum up to the covariance of all nodes [mm]."""
+        """Scaled samples, lost and changes [mm]: their outer products sum up to the covariance."""
         by_noise = self.samples / np.sqrt(self.samples.shape[2])
         scale = self.bias / np.sqrt(np.maximum((self.lost**2).sum(axis=2), _TINY))
         return np.concatenate([by_noise, scale[..., None] * self.lost, self.changes], axis=2)
 
     def with_bias(self, mesh: Mesh, change: FloatArray, of_slopes: float = 1.0) -> Deviations:
-        """Count a possible change (n, 2) of u [mm], rms around nodes; its slope so many times."""
+        """Add a change (n, 2) of u [mm] as bias, rms around nodes; slopes ``of_slopes`` times."""
         slope = of_slopes * nodal_gradient(mesh, change)
         spread = smoothed(mesh, np.einsum("nij,nkl->nijkl", slope, slope))
         return self._replace(
@@ -153,16 +153,16 @@ class Deviations(NamedTuple):
 def deviations(
     at: Linearised, cutoff: float, noise: float, in_gradient: FloatArray, unknowns: float
 ) -> Deviations:
-    """Estimate what noise and smoothing make of u, and what smoothing has taken from it.
+    """Estimate errors of u by noise and smoothing, and the part of u that smoothing has removed.
 
-    By noise, A^-1 e for random e of the covariance M times that of the noise, more of it where
-    residuals pull more, with what the regularisation allows for where there is no speckle; by
-    smoothing, what a larger weight changes (of long waves less what is put back), and elements.
+    Noise: A^-1 e for random e of covariance M times the noise variance, more where residuals pull
+    more, plus what the regularisation allows where there is no speckle. Bias: change of u by a
+    larger weight (long waves less where a part is put back), and elements' interpolation error.
 
     cutoff : wavelength [mm].
-    noise : its standard deviation in the residual [grey levels].
-    in_gradient : (m,) its variance in each element's gradient over that [-].
-    unknowns : their effective number.
+    noise : standard deviation of the residual's noise [grey levels].
+    in_gradient : (m,) noise variance of each element's gradient over that of the residual [-].
+    unknowns : effective number of unknowns.
     """
     mesh, weight, here = at.body.mesh, at.weight(cutoff), at.step(cutoff)
     factor, degrees = at.factor(weight), np.minimum(at.sums.counts, 12.0)
@@ -174,10 +174,10 @@ def deviations(
     found = factor.solve(random).reshape(-1, 2, SAMPLES)
     lost = none = found[..., :0]
     taken = share = np.zeros_like(error := interpolation_error(mesh, at.u.reshape(-1, 2)))
-    if isinstance(at.prior, Smoothness):  # what a law allows is not known
+    if isinstance(at.prior, Smoothness):  # what a law allows is unknown
         lost = factor.solve(at.body.smoothness_samples).reshape(-1, 2, SAMPLES)
         blank = mean_around(mesh, 1.0 - at.signal)
-        # The roughness that was found is that of so many unknowns, or the weight is too large.
+        # If u is rougher than its effective unknowns explain, the weight is too large.
         grown = float((at.u - at.prior.start) @ at.penalty)
         rough = weight * grown / max(noise**2 * unknowns, _TINY)
         wide = noise * np.sqrt(weight * blank * max(at.mean(in_gradient), rough))
@@ -190,7 +190,7 @@ def deviations(
         share = smoothed(mesh, (beyond > 0.0).astype(float))
     change = (at.step(cutoff, _STRONGER) - here).reshape(-1, 2)
     more, again = _STRONGER * weight, change
-    for _ in range(2):  # as much is taken as with the weight used in one step, or more
+    for _ in range(2):  # removes as much as one step with the weight used, or more
         again = at.factor(more).solve(more * (at.R @ again.ravel())).reshape(-1, 2)
     missing = change + share * (again - change)
     sd = Deviations(found, lost, none, error, gradient_covariance(mesh, found), share * taken)
@@ -198,7 +198,7 @@ def deviations(
 
 
 def uncertain(at: Linearised, cutoff: float, noise: FloatArray) -> FloatArray:
-    """(2 n, SOME + 1) noise and bias of u [mm], whose outer products sum up to its covariance."""
+    """(2 n, SOME + 1) errors of u by noise and bias [mm]; their outer products' sum: covariance."""
     random = at.body.random(noise[:, None, None, None] * at.sums.blocks, SOME)
     here = at.right(weight := at.weight(cutoff))
     found = at.factor(weight).solve(np.column_stack([here, random]))
@@ -209,10 +209,10 @@ def uncertain(at: Linearised, cutoff: float, noise: FloatArray) -> FloatArray:
 def contradicted(
     difference: FloatArray, free: Deviations, lawful: Deviations, nodes: IntArray
 ) -> float:
-    """Share of components at nodes where solutions with and without a law differ significantly.
+    """Share of components at ``nodes`` where solutions with and without a law differ significantly.
 
-    Significant are 3 standard deviations of the difference (n, 2) [mm], by the noise that both have
-    in common and by the smoothing of that without a law.
+    A difference (n, 2) [mm] is significant if it exceeds 3 standard deviations: those by noise of
+    the two solutions' difference, and those by smoothing of the solution without a law.
     """
     noise = np.mean((lawful.samples - free.samples) ** 2, axis=2)
     limit = _SIGNIFICANT * np.sqrt(noise + free.bias**2)
@@ -220,7 +220,7 @@ def contradicted(
 
 
 def gradient_covariance(mesh: Mesh, samples: FloatArray) -> FloatArray:
-    """(n, 4, 4) covariance of xx, xy, yx, yy of grad u [-], by random displacements (n, 2, s)."""
+    """(n, 4, 4) covariance of xx, xy, yx, yy of grad u [-] from random u (n, 2, s) [mm]."""
     n, _, count = samples.shape
     slopes = nodal_gradient(mesh, samples.reshape(n, -1)).reshape(n, 2, count, 2)
     J = slopes.swapaxes(2, 3).reshape(n, 4, count)

@@ -1,9 +1,9 @@
 """The whole displacement of a speckled body by regularised finite-element DIC.
 
-Minimises sum (f(x) - g(x + u))^2 + lambda (u - u_0)'R(u - u_0) over the displacements u of the
-nodes of a mesh of the material by Gauss-Newton steps, from blurred images and long cut-off
-wavelengths to the images themselves; R is the smoothness of what is added to the start u_0. The
-last cut-off wavelength is found from the images alone, see ``cutoff``.
+Minimises sum (f(x) - g(x + u))^2 + lambda (u - u_0)'R(u - u_0) over the nodal displacements u of a
+mesh of the material. Gauss-Newton steps go from blurred images and long cut-off wavelengths to the
+unfiltered images. R penalises the roughness of the difference from the start u_0. The last cut-off
+wavelength is estimated from the images alone, see ``cutoff``.
 """
 
 from __future__ import annotations
@@ -53,74 +53,74 @@ from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import picked
 
 _FIRST_PX = 18.0
-"""Cut-off wavelength from which on the best one is sought [px]."""
+"""Cut-off wavelength at which the search for the best one begins [px]; below, with a law."""
 _FIRST_WITH_LAW_PX = 150.0
 _WRONG = 0.075
-"""Share of the edges' nodes that contradict a law beyond which it is said to be wrong; not 0.003,
-because smoothing takes more away at edges than bars know (docs/explanation/whole_field_laws.md)."""
+"""Share of edge nodes contradicting a law above which a warning says it is wrong; not 0.003, as
+smoothing removes more at edges than error bars include (docs/explanation/whole_field_laws.md)."""
 _BLANK = 0.01
-"""Part of the material without speckle, beyond which that is warned of."""
+"""Share of the material without speckle above which a warning is given [-]."""
 _SHORT_PX, _SHORT_AT_A_NODE_PX = 0.1, 0.5
-"""After shorter steps the matrices are kept, where only the images make them change and steps get
-shorter; rms over the nodes, and of a single one [px]."""
+"""Matrices are kept after steps shorter than these, rms over nodes and longest of one node [px],
+if only the images change them (no law) and steps decrease."""
 _LEAST_DET = 0.1
-"""Elements that shrink to less are an iteration gone astray."""
+"""Lower bound on det F [-]: an element that shrinks to less shows a diverged iteration."""
 _UNLIKE, _SEEN = 0.25, 0.25
-"""Images don't match in an element with a larger mean square residual, over the reference's
-variance, or with a smaller share of its pixels found on the deformed image's material."""
+"""Images don't match in an element whose mean square residual less noise, over the reference's
+variance, is larger, or whose share of pixels on the deformed image's material is smaller."""
 _BORDER_PX = 2.0
-"""Edges this close to the image's border aren't the body's [px]."""
+"""Edges closer than this to the image's border are no edges of the body [px]."""
 _ROUNDS = 3
 _SETTLED = 0.5
-"""Relative change of the cut-off wavelength that needs no other round."""
+"""No further round is made if the log of the cut-off wavelength changes by less [-]."""
 
 
 @dataclass(frozen=True)
 class _Stage:
-    """One stage from coarse to fine."""
+    """One stage of the coarse-to-fine sequence."""
 
     level: Level
     """Binning and blur of the images."""
     cutoff_px: float
-    """Wavelength of which the regularisation leaves one half [px]."""
+    """Wavelength whose amplitude the regularisation halves [px]."""
     tolerance_px: float = 0.1
-    """Of the step that ends it, rms over the nodes, a tenth of the longest [px]."""
+    """The stage ends once the step's rms over nodes and a tenth of its longest are below [px]."""
 
 
 _STAGES = (_Stage(Level(2, 3.0), 120.0, 0.4), _Stage(Level(2, 1.5), 50.0, 0.4), _Stage(FULL, 30.0))
-"""Before the last one, which has the unfiltered images, too, and the cut-off that is sought."""
+"""Stages before the last, which uses unfiltered images and the cut-off that is searched for."""
 _LAST_TOLERANCE_PX = 0.01
 _LONGEST_STEP_PX = 8.0
-"""Of a node, in one step."""
+"""Largest change of a node's displacement in one step."""
 
 
 @dataclass(frozen=True)
 class Law:
-    """A material law to regularise with."""
+    """A material law that regularises the displacement."""
 
     material: Material
-    """Of the body, in plane strain; a factor of its moduli doesn't matter."""
+    """Material of the body, in plane strain; a common factor of its moduli has no effect."""
     loaded: Callable[[FloatArray], BoolArray]
-    """Which points (n, 2) of the body [mm] forces may act on: (n,) True there."""
+    """Maps points (n, 2) of the body [mm] to (n,) True where unknown forces may act."""
 
 
 @dataclass(frozen=True)
 class FiniteElementOptions:
-    """How to measure on a mesh."""
+    """Options of a measurement on a mesh."""
 
     element_px: float = 24.0
     edge_element_px: float = 12.0
-    """Edge length of the elements inside and along edges, where the mesh is to be made [px]."""
+    """Edge length of elements inside the body and along its edges, if a mesh is generated [px]."""
     cutoff_px: float | None = None
-    """Cut-off wavelength of the last stage [px]; None for the one with the least estimated risk."""
+    """Cut-off wavelength of the last stage [px]; None for that of the lowest estimated risk."""
     law: Law | None = None
-    """By which to regularise in the end; None for the smoothness of what is added to the start."""
+    """Regularises the last stage; None for smoothness of the difference from the start."""
     edge_px: int = 0
     """Pixels closer than this to the mask's edge are left out of unfiltered images [px]."""
     steps: int = 4
-    """Of Gauss-Newton in each stage, at most."""
+    """Largest number of Gauss-Newton steps in each stage."""
     free_edges: bool = True
-    """Whether to measure with what free edges have in common, without a law: see ``free_edges``."""
+    """Without a law: whether to use the strain relation of free edges, see ``free_edges``."""
 
     def __post_init__(self) -> None:
         for name, low in (("element_px", 4), ("edge_element_px", 4), ("edge_px", 0), ("steps", 1)):
@@ -129,13 +129,13 @@ class FiniteElementOptions:
             require_within("finite-element DIC: expected cutoff_px", self.cutoff_px, 0, above=True)
 
     def body(self, mask: BoolArray, grid: PixelGrid) -> Body:
-        """What can be meshed of a mask (rows, cols); InputError as for ``mesh_of_mask``."""
+        """Mesh a mask (rows, cols) as far as possible; InputError as for ``mesh_of_mask``."""
         return Body(*mesh_of_mask(mask, grid, self.element_px, self.edge_element_px))
 
 
 Start = Result | Callable[[FloatArray], FloatArray] | FloatArray
-"""A correlation's result, what gives displacements (n, 2) at points (n, 2), or those at the nodes
-[mm]."""
+"""Result of a correlation, a function of points (n, 2) that returns displacements (n, 2), or the
+displacements (n, 2) of the nodes; all in mm."""
 
 
 def measure_displacement(
@@ -148,16 +148,16 @@ def measure_displacement(
 ) -> NodalResult:
     """Measure the whole displacement on a mesh of the material.
 
-    InputError if the mesh is folded or of other elements, covers no more than a part of the mask,
-    or has parts that show no pixels.
+    InputError if the mesh is folded or has other elements, covers only a part of the mask, or has
+    parts without pixels.
 
-    pair : of images. Without a mask every pixel counts.
-    start : where the measurement begins: a correlation's result, or any displacement closer to the
-        truth than about 10 px; what is found is smooth relative to it.
-    on : a mesh, T6 or T3, in the reference's frame [mm]; by default made from the pair's mask. For
-        several images a Body, so that what they have in common is done once.
-    options : how to measure.
-    progress : listener.
+    pair : images. Without a mask every pixel counts.
+    start : initial guess: a correlation's result, or any displacement within about 10 px of the
+        true one. The difference between the measured displacement and the start is smooth.
+    on : mesh of T6 or T3 elements in the reference's frame [mm]; by default generated from the
+        pair's mask. Pass a Body for several images, so that shared computations are done once.
+    options : options of the measurement.
+    progress : receives the progress.
     """
     course = _Measurement(pair, start, on, options or FiniteElementOptions())
     for stage in counted((*_STAGES, None), progress, "whole displacement"):
@@ -171,9 +171,9 @@ def measure_displacement(
 def coarse_displacement(
     pair: ImagePair, start: Start, on: Body, *, options: FiniteElementOptions
 ) -> tuple[FloatArray, BoolArray]:
-    """(n, 2) u [mm] before the last cut-off is sought, and at which nodes (n,) the images match.
+    """(n, 2) u [mm] before the search for the last cut-off; (n,) True at nodes with matched images.
 
-    Elsewhere it has ended in a local minimum. For the rest see :func:`measure_displacement`.
+    At other nodes u is in a local minimum. For the arguments see :func:`measure_displacement`.
     """
     course = _Measurement(pair, start, on, options)
     for stage in (*_STAGES, _Stage(FULL, _FIRST_PX)):
@@ -186,18 +186,18 @@ def coarse_displacement(
 
 @dataclass(frozen=True, eq=False)
 class _LevelOnMesh:
-    """A level of a pair of images on a mesh, and what weighs its residual."""
+    """A pyramid level of an image pair on a mesh, with the gradient that weighs its residual."""
 
     level: Level
     images: LevelPair
     pixels: ElementPixels
     slope_noise: float = 0.0
-    """Variance of that gradient by noise [grey levels^2/mm^2]."""
+    """Noise variance of the gradient that weighs the residual [grey levels^2/mm^2]."""
     continued: ContinuedPixels = NONE_CONTINUED
 
 
 class _Measurement:
-    """A measurement on its way: the images of a stage, the displacement of the nodes."""
+    """State of a running measurement: the images of a stage and the nodal displacements."""
 
     def __init__(
         self, pair: ImagePair, start: Start, on: Mesh | Body | None, options: FiniteElementOptions
@@ -223,7 +223,7 @@ class _Measurement:
         self.free: tuple[FloatArray, Deviations] | None = None
         self.contradicted: float | None = None
         self.edges: FreeEdges | None = None
-        self.by_edges: FloatArray = np.zeros_like(self.u)  # what they change, alike in all cells
+        self.by_edges: FloatArray = np.zeros_like(self.u)  # change of u by the relation at edges
         self.tried: tuple[Risk, ...] = ()
         self.warnings = body.changes
         images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
@@ -243,7 +243,7 @@ class _Measurement:
         return self.level
 
     def _weighed_by_reference(self, on: _LevelOnMesh) -> _LevelOnMesh:
-        """Weigh the residual by the reference's gradient, blurred as noise asks for."""
+        """Weigh the residual by the reference's gradient, blurred as much as its noise requires."""
         f, mask, px = self.pair.reference, self.pair.masks[0], self.pair.grid.pixel_size
         spline = continued_spline(f, mask, self.order)
         _, d_row, d_col = spline.sample(on.pixels.row, on.pixels.col)
@@ -261,7 +261,7 @@ class _Measurement:
         )  # fmt: skip
 
     def linearised(self) -> Linearised:
-        """Normal equations at u; after short steps with the matrices that there are."""
+        """Normal equations at u; after short steps the previous matrices are used again."""
         on, kept, body = self.level, self.kept, self.body
         assert on is not None
         nodal, is_new = self.u.reshape(-1, 2), kept is None
@@ -288,7 +288,7 @@ class _Measurement:
         return self.kept
 
     def through(self, stage: _Stage) -> None:
-        """Take steps until they are short."""
+        """Make Gauss-Newton steps until they are shorter than the stage's tolerance."""
         self._prepare(stage.level)
         px, last = self.pair.grid.pixel_size, np.inf
         for _ in range(self.options.steps):
@@ -305,7 +305,7 @@ class _Measurement:
                 break
 
     def regularise(self) -> None:
-        """Find the last cut-off wavelength and what it gives: without a law, then with one."""
+        """Find the last cut-off wavelength and its u: without a law, then with one if given."""
         self._prepare(FULL)
         law, given = self.options.law, self.options.cutoff_px
         self._regularised(_FIRST_PX, None if law is not None else given)
@@ -319,7 +319,7 @@ class _Measurement:
             self._regularised(_FIRST_WITH_LAW_PX, given)
 
     def _through_edges(self) -> None:
-        """Learn what free edges have in common, and measure with that, too."""
+        """Learn the strain relation of free edges, and measure again with it as additional data."""
         at, px = self.linearised(), self.pair.grid.pixel_size
         left, right, bottom, top = self.pair.grid.extent
         off = _BORDER_PX * px
@@ -331,14 +331,14 @@ class _Measurement:
             self.by_edges = self.u - at.u
 
     def _assessed(self) -> tuple[Linearised, Risk, Deviations]:
-        """What there is at the present displacement."""
+        """Normal equations, risk and standard deviations at the present displacement."""
         at, px = self.linearised(), self.pair.grid.pixel_size
         noise = self._noise_in(at)
         here = risk(at, self.cutoff_px, px, at.mean(noise))
         return at, here, deviations(at, self.cutoff_px * px, here.noise, noise, here.unknowns)
 
     def _against_law_free(self, sd: Deviations) -> Deviations:
-        """Count the difference to the law-free solution as bias; notice a law that is wrong."""
+        """Add the difference from the law-free solution as bias; warn if it contradicts the law."""
         if self.free is None or self.options.law is None:
             return sd
         (u, free), mesh = self.free, self.body.mesh
@@ -356,13 +356,13 @@ class _Measurement:
         return sd.with_bias(mesh, difference / np.sqrt(6.0))
 
     def _regularised(self, first_px: float, cutoff: float | None) -> None:
-        """Go to a cut-off wavelength, given or to be found from a first one on."""
+        """Measure with a given cut-off wavelength, or search for the best one from ``first_px``."""
         px, self.tried = self.pair.grid.pixel_size, ()
         if cutoff is None:
             cutoff = first_px
             for _ in range(_ROUNDS):
                 self.through(_Stage(FULL, cutoff))
-                before, self.kept = cutoff, None  # the risk needs the matrix at u itself
+                before, self.kept = cutoff, None  # the risk needs the matrix at the present u
                 at = self.linearised()
                 self.tried = least_risk(at, before, px, at.mean(self._noise_in(at)))
                 cutoff = best_of(self.tried)
@@ -377,9 +377,9 @@ class _Measurement:
         return np.asarray(np.eye(2) + gradients.mean(axis=1))
 
     def _noise_in(self, at: Linearised) -> FloatArray:
-        """(m,) variance of noise in each element's gradient, over that of the residual's [-].
+        """(m,) noise variance of each element's gradient over that of the residual [-].
 
-        f's has nothing to do with its own slopes: only their signal counts; g's goes by 1/det F.
+        Noise of f is independent of its slopes' noise: only their signal counts; g's is over det F.
         """
         u, det = self.u.reshape(-1, 2)[self.body.mesh.cells], self._deformation_gradient()
         det = np.maximum(determinant(det), _LEAST_DET)
@@ -388,10 +388,10 @@ class _Measurement:
         return np.asarray((f * at.signal + g / det) / (f + g * value))
 
     def _without_edges(self, at: Linearised) -> FloatArray:
-        """(n, 2, 1) change of u [mm] with twice as many rows of pixels left out at edges, or one.
+        """(n, 2, 1) change of u [mm] if twice as many rows of pixels are left out at edges, or one.
 
-        By such changes show what images are wrong by there, and elements beyond their pixels. What
-        is known of edges would hide it: it is the change of what is measured without that.
+        Shows errors of the images at edges and of elements that reach beyond their pixels. The
+        relation at free edges would hide them: the change is that of a measurement without it.
         """
         on, body = self._prepare(FULL), self.body
         weight = at.weight(self.cutoff_px * self.pair.grid.pixel_size)
@@ -404,7 +404,7 @@ class _Measurement:
         return (others.factor(weight).solve(others.right(weight)) + self.by_edges).reshape(-1, 2, 1)
 
     def result(self) -> NodalResult:
-        """Make the result, with its standard deviations."""
+        """Result of the measurement, with standard deviations."""
         at, here, sd = self._assessed()
         sd = self._against_law_free(sd)
         if not (np.isfinite(self.u).all() and np.isfinite(sd.by_noise + sd.bias).all()):

@@ -1,22 +1,22 @@
-"""Linear systems of the nodes of a mesh: sparsity, smoothness or a law's imbalance, the factor.
+"""Linear systems of nodal displacements: sparsity, regularisation (by law or not), the factor.
 
 A matrix of displacements has three symmetric nodal parts, xx, xy and yy; unknown 2 i + c is
 component c at node i.
 
-Smoothness, without a material law:
+Regularisation without a material law, by smoothness:
 
     u'Ru = sum over interior sides int (1/h) |[grad grad u]|^2 + (100/h^3) |[grad u]|^2 ds,
 
-[.] being the jump across a side of length h; second gradients are an element's mean. It is zero for
-quadratic displacements, and natural (free) at all boundaries: what finite elements have of the
-integral of |grad grad grad u|^2, whose minimum under noise is the smoothing spline of third order,
-with the jumps of gradients as interior penalty (G. Engel et al., Comput. Methods Appl. Mech. Eng.
-191 (2002), doi 10.1016/S0045-7825(02)00286-4). A wave of length T costs (2 pi/T)^6 times its mean
-square, so that a weight of (l/T)^6 v'Mv/v'Rv for any wave v halves what of it is at the wavelength
+[.] being the jump across a side of length h; second gradients are means over an element. u'Ru is
+zero for quadratic u, with natural (free) boundary conditions. It is the finite-element equivalent
+of the integral of |grad grad grad u|^2, which yields smoothing splines of third order, and jumps of
+gradients are an interior penalty (G. Engel et al., Comput. Methods Appl. Mech. Eng. 191 (2002), doi
+10.1016/S0045-7825(02)00286-4). A wave v of length T costs (2 pi/T)^6 times its mean square, so that
+the weight (l/T)^6 v'Mv/v'Rv of any such wave halves the amplitude of waves of the cut-off length
 l: H. Leclerc, J.-N. Perie, S. Roux, F. Hild, Exp. Mech. 51 (2011), doi 10.1007/s11340-010-9407-6.
 
-With a law: where nothing loads the body its internal forces f vanish, at interior nodes as on free
-edges. Penalised is their sum of squares |D f(u)|^2, D leaving out the loaded nodes, not the energy:
+With a law: the internal forces f vanish where no load acts, at interior nodes and on free edges.
+The penalty is their sum of squares |D f(u)|^2, not the energy; D leaves out the loaded nodes:
 M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the moduli cancels.
 """
 
@@ -41,36 +41,36 @@ from modeharvest.util.compiled import compiled
 from modeharvest.util.elements import nodal_sums, reference_element, shape_gradients
 
 _PENALTY = 100.0
-"""Of jumps of gradients across sides, against those of second gradients [-]."""
+"""Weight of gradient jumps across sides, relative to jumps of second gradients [-]."""
 _QUADRATURE = np.array([[1 / 6, 1 / 6], [2 / 3, 1 / 6], [1 / 6, 2 / 3]])
 _LEAST_DET = 0.05
-"""Points of an element that shrink to less have no part in it: an iteration gone astray."""
+"""Integration points of smaller det F are left out: they show a diverged iteration [-]."""
 SAMPLES = 32
-"""Of random vectors: standard deviations by them are known to 13 %."""
+"""Number of random vectors; standard deviations estimated from them are known to 13 %."""
 SOME = 8
-"""Of random vectors, where less will do."""
+"""Number of random vectors where a coarser estimate suffices."""
 _TINY = 1e-200
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
 
 
 @dataclass(frozen=True, eq=False)
 class NodalPattern:
-    """Which nodes have to do with each other, in compressed rows."""
+    """Sparsity pattern of nodal matrices: coupled nodes, in compressed rows."""
 
     indptr: IntArray
     indices: IntArray
-    """(n + 1,), (q,): the neighbours of each node, itself included, ascending."""
+    """(n + 1,) row pointers; (q,) nodes coupled with each node, itself included, ascending."""
 
     @classmethod
     def of(cls, count: int, *groups: IntArray) -> NodalPattern:
-        """From groups of nodes (m, k) that have to do with one another, out of ``count``."""
+        """Pattern of ``count`` nodes, from groups (m, k) of nodes coupled with each other."""
         rows = np.concatenate([np.repeat(g, g.shape[1], axis=1).ravel() for g in groups])
         cols = np.concatenate([np.tile(g, (1, g.shape[1])).ravel() for g in groups])
         joined = csr_array((np.ones(rows.size, np.int8), (rows, cols)), (count, count))  # each once
         return cls(joined.indptr.astype(np.int64), joined.indices.astype(np.int64))
 
     def assembled(self, nodes: IntArray, blocks: FloatArray) -> csr_array:
-        """(2 n, 2 n) sums over nodes (m, k) of blocks xx, xy, yy, or with yx, (m, 3 or 4, k, k)."""
+        """(2 n, 2 n) sums of blocks (m, 3 or 4, k, k), xx, xy, (yx,) yy, at nodes (m, k)."""
         indptr, indices = self._of_components
         data = np.zeros(indices.size)
         _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), data)
@@ -78,7 +78,7 @@ class NodalPattern:
 
     @cached_property
     def _of_components(self) -> tuple[IntArray, IntArray]:
-        """Row pointers and columns."""
+        """Row pointers and columns of the (2 n, 2 n) matrix."""
         ones = np.ones((self.indices.size, 2, 2), np.int8)
         whole = bsr_array((ones, self.indices, self.indptr)).tocsr()
         return whole.indptr, whole.indices
@@ -100,7 +100,7 @@ def _scatter(indptr: Any, indices: Any, nodes: Any, blocks: Any, data: Any) -> N
 
 
 def interior_sides(cells: IntArray) -> IntArray:
-    """(s, 4) first cell, its side 0 ... 2, second cell and its side, of sides between two cells."""
+    """(s, 4) for sides between two cells: first cell, its side 0 ... 2, second cell, its side."""
     middle = cells[:, 3:].ravel()
     order = np.argsort(middle, kind="stable")
     same = middle[order[1:]] == middle[order[:-1]]
@@ -109,7 +109,7 @@ def interior_sides(cells: IntArray) -> IntArray:
 
 
 def second_gradients(mesh: Mesh) -> FloatArray:
-    """(m, k, 2, 2) second derivatives of the shape functions, means over elements [1/mm^2]."""
+    """(m, k, 2, 2) second derivatives of the shape functions, averaged per element [1/mm^2]."""
     local = shape_gradients(mesh.element, _QUADRATURE)  # (q, k, 2)
     coefficients = reference_element(mesh.element).coefficients
     # Of 1, xi, eta, xi^2, xi eta, eta^2 only the last three have second derivatives.
@@ -126,20 +126,20 @@ def second_gradients(mesh: Mesh) -> FloatArray:
 
 
 class SmoothnessRoots(NamedTuple):
-    """What R is made of, side by side: a part is its roots times their transpose."""
+    """Factorised form of R by sides: each contribution is its roots times their transpose."""
 
     size: int
     """Nodes of the mesh."""
     nodes: IntArray
     roots: FloatArray
-    """(s, 2 k) around each interior side, and (s, 2 k, c) [1/mm^2]."""
+    """(s, 2 k) nodes of the two cells at each interior side, and (s, 2 k, c) roots [1/mm^2]."""
 
     @classmethod
     def of(cls, mesh: Mesh) -> SmoothnessRoots:
-        """Of a T6 mesh."""
+        """Compute the roots of a T6 mesh."""
         curved, (first, side, second, other) = second_gradients(mesh), interior_sides(mesh.cells).T
         _, here, along = on_sides(mesh, first, side, _GAUSS)
-        there = on_sides(mesh, second, other, 1.0 - _GAUSS)[1]  # which goes the other way
+        there = on_sides(mesh, second, other, 1.0 - _GAUSS)[1]  # in the opposite direction
         speed = np.linalg.norm(along, axis=-1)
         shares = 0.5 * speed / speed.mean(axis=1, keepdims=True)
         corners = mesh.nodes[mesh.cells[first, (side + 1) % 3]], mesh.nodes[mesh.cells[first, side]]
@@ -165,44 +165,44 @@ class SmoothnessRoots(NamedTuple):
 
 
 class Body:
-    """A T6 mesh of the material, with what all measurements on it share: patterns, the factor."""
+    """A T6 mesh of the material with all that measurements on it share: patterns, the factor."""
 
     def __init__(
         self, mesh: Mesh, mask: BoolArray | None = None, changes: tuple[str, ...] = ()
     ) -> None:
         self.mesh, self.pixels = mesh, MeshPixels(mesh)
         self.mask, self.changes = mask, changes
-        """(rows, cols) True on pixels that count, None for those of any mask; what was left out."""
+        """(rows, cols) True on pixels used, None for all of a mask; notes on parts left out."""
         roots = SmoothnessRoots.of(mesh)
         with ThreadPoolExecutor(1) as beside:
             samples = beside.submit(roots.samples, SAMPLES)
             self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, roots.nodes)
             self.smoothness = roots.matrix(self.pattern)
             self.smoothness_samples = samples.result()
-        """(2 n, 2 n) R of both components, and (2 n, SAMPLES) random vectors of that covariance."""
+        """(2 n, 2 n) R of both components, and (2 n, SAMPLES) random vectors of covariance R."""
         edge = np.diff(mesh.nodes[mesh.cells[:, :2]], axis=1)
         self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=2)))
-        """Of waves along x and y, of both components, that compare data and smoothness [mm]."""
+        """Wavelength [mm] of the waves (along x and y, both components) that compare M with R."""
         self._waves = np.kron(np.cos(2.0 * np.pi / self.wavelength * mesh.nodes), np.eye(2))
         self.roughness = self.energies(self.smoothness)
         self._factor: Factor | None = None
         self._factorised: tuple[csr_array, csr_array, float] | None = None
-        self._stored, self.library = 0, ""  # entries of what is factorised, and what does it
+        self._stored, self.library = 0, ""  # entries of the factorised matrix, and its library
 
     def matrix(self, blocks: FloatArray) -> csr_array:
-        """(2 n, 2 n) of the blocks (m, 3, 6, 6) of the elements."""
+        """Assemble element blocks (m, 3, 6, 6) to a matrix (2 n, 2 n)."""
         return self.pattern.assembled(self.mesh.cells, blocks)
 
     def vector(self, parts: FloatArray) -> FloatArray:
-        """(2 n,) of the parts (m, 6, 2) of the elements, or (2 n count,) of (m, 6, 2 count)."""
+        """Assemble element vectors (m, 6, 2) to (2 n,), or (m, 6, 2 count) to (2 n count,)."""
         return nodal_sums(len(self.mesh.nodes), self.mesh.cells, parts).ravel()
 
     def energies(self, matrix: csr_array) -> float:
-        """Sum of v'Av over some waves v."""
+        """Sum of v'Av over the waves v that compare matrices A."""
         return float(np.sum(self._waves * (matrix @ self._waves)))
 
     def factor(self, M: csr_array, R: csr_array, weight: float) -> Factor:
-        """Factorise M + lambda R, unless these were the last ones."""
+        """Factorise M + lambda R; if all three are those of the last call, return its factor."""
         last = self._factorised
         if self._factor and last and last[0] is M and last[1] is R and last[2] == weight:
             return self._factor
@@ -220,7 +220,7 @@ class Body:
         return self._factor
 
     def smoothed(self, u: FloatArray, cutoff: float, known: BoolArray | bool = True) -> FloatArray:
-        """(n, 2) u less waves shorter than a cut-off [mm], from nodes (n,) where it is known."""
+        """(n, 2) u without waves shorter than a cut-off [mm], from the nodes (n,) with known u."""
         own = np.broadcast_to(known, len(u))[:, None] * np.array([1.0, 0.0, 1.0])
         one = self.pattern.assembled(np.arange(len(u))[:, None], own[..., None, None])
         R = self.smoothness
@@ -230,10 +230,10 @@ class Body:
         return self.factor(one, R, weight / self.roughness).solve(one @ u.ravel()).reshape(-1, 2)
 
     def samples(self, M: FloatArray, pull: FloatArray, free: FloatArray) -> tuple[FloatArray, ...]:
-        """(2 n, SAMPLES) random vectors of the covariance M (m, 3, 6, 6), times (n,) >= 1.
+        """(2 n, SAMPLES) random vectors of covariance M (m, 3, 6, 6) times the inflation (n,) >= 1.
 
-        ``pull`` (m, 6, 2): what there is of them, of (m,) degrees of freedom. What is alike over an
-        element, its own error first of all, pulls its nodes more than noise as large.
+        ``pull`` (m, 6, 2) is the actual vector, ``free`` (m,) its degrees of freedom. Residuals
+        correlated over an element, mainly by its own error, pull its nodes more than equal noise.
         """
         m, own = len(M), _definite(M)
         ridge = 1e-4 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(12)
@@ -245,24 +245,24 @@ class Body:
         return self.random(share * M, SAMPLES), inflation
 
     def random(self, M: FloatArray, count: int) -> FloatArray:
-        """(2 n, count) random vectors of the covariance M (m, 3, 6, 6)."""
+        """(2 n, count) random vectors of covariance M, given by element blocks (m, 3, 6, 6)."""
         z = np.random.default_rng(0).standard_normal((len(M), 12, count))
         z = np.linalg.cholesky(_definite(M)) @ z
         return self.vector(z.reshape(len(M), 6, -1)).reshape(-1, count)
 
 
 def _definite(M: FloatArray) -> FloatArray:
-    """(m, 12, 12) blocks (m, 3, 6, 6) of elements, of which those with few pixels are singular."""
+    """(m, 12, 12) of element blocks (m, 3, 6, 6), made definite: few pixels leave them singular."""
     M = M[:, [[0, 1], [1, 2]]].transpose(0, 3, 1, 4, 2).reshape(len(M), 12, 12)
     M[:, range(12), range(12)] *= 1.0 + 1e-9
     return np.asarray(M + max(1e-12 * M.max(), _TINY) * np.eye(12))
 
 
 class Smoothness:
-    """How rough what is added to a start (n, 2) is, on a body's mesh."""
+    """Roughness of the difference between u and a start (n, 2) [mm], on a body's mesh."""
 
     power = 6
-    """Of a wave number, in what a wave costs."""
+    """Exponent of the wave number in the penalty of a wave."""
 
     def __init__(self, body: Body, start: FloatArray) -> None:
         self.body, self.start = body, start.ravel()
@@ -274,10 +274,10 @@ class Smoothness:
 
 
 class Imbalance:
-    """The forces of a T6 mesh [mm] that nothing balances; smallest in a body that obeys a law.
+    """Unbalanced nodal forces of a T6 mesh [mm], which are least if the body obeys its law.
 
     material : of the body, in plane strain.
-    loaded : (n,) True at nodes on which unknown forces act.
+    loaded : (n,) True at nodes where unknown forces may act, which are left out.
     """
 
     power = 4
@@ -295,12 +295,12 @@ class Imbalance:
         self._pattern = NodalPattern.of(len(mesh.nodes), mesh.cells)
 
     def deformation_gradient(self, u: FloatArray) -> FloatArray:
-        """(m, q, 2, 2) F at the points of each element [-], of displacements (2 n,) [mm]."""
+        """(m, q, 2, 2) F at the integration points of each element [-], for u (2 n,) [mm]."""
         found = (self._gradient @ u.reshape(-1, 2)).reshape(*self.weights.shape, 2, 2)
         return np.asarray(np.eye(2) + found.swapaxes(2, 3))
 
     def forces(self, u: FloatArray) -> tuple[FloatArray, csr_array]:
-        """(2 n,) internal forces at u (2 n,) and their derivatives (2 n, 2 n), up to a factor."""
+        """(2 n,) internal forces at u (2 n,) [mm], their tangent K (2 n, 2 n), up to a factor."""
         F = self.deformation_gradient(u)
         there = np.linalg.det(F) > _LEAST_DET
         F[~there] = np.eye(2)
@@ -314,7 +314,7 @@ class Imbalance:
         return f.ravel(), self._pattern.assembled(self.mesh.cells, K.swapaxes(2, 3))
 
     def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
-        """(2 n, 2 n) K'DK and (2 n,) K'Df."""
+        """(2 n, 2 n) K'DK and (2 n,) K'Df, the Gauss-Newton matrix and gradient of |D f|^2/2."""
         f, K = self.forces(u)
         DK = self._free @ K
         return csr_array(K.T @ DK), np.asarray(DK.T @ f)
@@ -322,47 +322,47 @@ class Imbalance:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Normal equations at some displacement of the nodes."""
+    """Normal equations at a displacement u of the nodes."""
 
     body: Body
     prior: Smoothness | Imbalance
-    """What regularises."""
+    """The regularisation."""
     u: FloatArray
-    """(2 n,) [mm]."""
+    """(2 n,) nodal displacements [mm]."""
     sums: NodalEquations
-    """Over the pixels; the blocks weighed, and perhaps of another displacement close by."""
+    """Sums over the pixels; blocks are weighed, and may be those of a nearby displacement."""
     signal: FloatArray
     gain: float
-    """See :meth:`NodalEquations.signal`; the square of their product weighs the blocks."""
+    """Results of :meth:`NodalEquations.signal`; their product squared weighs the blocks."""
     M: csr_array
     gradient: FloatArray
-    """(2 n, 2 n) and (2 n,): sums of h h' and of h r, so weighed."""
+    """(2 n, 2 n) weighed sums of h h', and (2 n,) sums of h r weighed by the product itself."""
     R: csr_array
     penalty: FloatArray
     """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
     ratio: float
-    """Of M to R, by the body's waves."""
+    """v'Mv over v'Rv, each summed over the body's waves v."""
     edges: FreeEdges | None = None
-    """That are known beside the images, as well as the noise of their residual is."""
+    """Relation at free edges, used as data besides the images; None for no such relation."""
     near: csr_array | None = None
-    """M and the matrix of what is known of edges, of another displacement close by."""
+    """Matrix of images and edge relation from a nearby displacement, used again if not None."""
 
     def mean(self, values: FloatArray) -> float:
         """Mean over the pixels of values (m,) of the elements."""
         return float(values @ self.sums.counts) / self.sums.pixels
 
     def weight(self, cutoff: float) -> float:
-        """The weight lambda of R for a cut-off wavelength [mm]."""
+        """Weight lambda of R for a cut-off wavelength [mm]."""
         return (cutoff / self.body.wavelength) ** self.prior.power * self.ratio
 
     @property
     def variance(self) -> float:
-        """Of the residual [grey levels^2]."""
+        """Mean square of the residual [grey levels^2]."""
         return self.sums.rms**2
 
     @cached_property
     def known(self) -> tuple[csr_array, FloatArray]:
-        """M and the gradient, with what is known of edges."""
+        """Matrix M and gradient, with the contributions of the relation at free edges."""
         if self.edges is None:
             return self.M, self.gradient
         blocks, e = self.edges.linearised(self.u)
@@ -373,7 +373,7 @@ class Linearised:
         return A, self.gradient + self.variance * e
 
     def factor(self, weight: float) -> Factor:
-        """M + lambda R, factorised, and what is known of edges."""
+        """Factor of M + lambda R, M with the contribution of the relation at free edges."""
         return self.body.factor(self.known[0], self.R, weight)
 
     def right(self, weight: float) -> FloatArray:
@@ -381,6 +381,6 @@ class Linearised:
         return self.known[1] - weight * self.penalty
 
     def step(self, cutoff: float, times: float = 1.0) -> FloatArray:
-        """(2 n,) Gauss-Newton step for a cut-off wavelength [mm], or so many times its weight."""
+        """(2 n,) Gauss-Newton step [mm] for a cut-off [mm], its weight multiplied by ``times``."""
         weight = times * self.weight(cutoff)
         return self.factor(weight).solve(self.right(weight))

@@ -1,6 +1,6 @@
 """Runs: a case from its TOML file to a folder of results, in stages that can be resumed.
 
-A module, or a folder, for each kind: virtual experiments, lattices, homogenized specimens,
+Each kind of case has a module or a folder: virtual experiments, lattices, homogenized specimens,
 photographs and the twin of a real experiment, studies, designs of tests, benchmarks for DIC codes.
 """
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 def run(
     case: str | Path | CaseModel, folder: Path | str, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Run a case of any kind, from its options to its report; what is finished is not done again.
+    """Run a case of any kind, from its options to its report; finished stages are not repeated.
 
     ``case``: a shipped case's name, the path of a TOML file, or the case itself: a virtual
     experiment, the twin of a real one, a lattice, a homogenized specimen, a design, a study, or
-    photographs. ``folder``: where to leave the files. Returns the content of ``summary.json``.
+    photographs. ``folder``: where files are written. Returns the content of ``summary.json``.
     """
     from modeharvest.runs.case import Case, CaseModel, read_tables, table_of_kind
 

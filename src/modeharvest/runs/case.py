@@ -1,10 +1,10 @@
-"""Cases: a TOML file turned into checked objects, each fault in one line.
+"""Cases: a TOML file is turned into validated objects, each error is reported in one line.
 
 A case is a pydantic model whose fields are the project's frozen dataclasses, so a case file,
-``--help`` and the Python objects use the same names and units. What all kinds of cases share is
-here, and the virtual experiment; with a table ``[calibration]`` that is the twin of a real one:
-photographs through a lens that has to be calibrated first, to be harvested. Infinite lattices,
-photographs and studies have modules of their own.
+``--help`` and the Python objects use the same names and units. This module has what all kinds of
+cases share, and the virtual experiment. A virtual experiment with a table ``[calibration]`` is the
+twin of a real one: its photographs are taken through a lens that must be calibrated before they are
+harvested. Infinite lattices, photographs and studies are defined in other modules.
 """
 
 from __future__ import annotations
@@ -43,25 +43,25 @@ _KINDS = {
     "images": ("photographs of a test", "modeharvest harvest {}", "photographs"),
     "experiment": ("a virtual experiment", "modeharvest run {}", "paper-virtual"),
 }
-"""By the table that only such a case has, looked for in this order: what it is, who runs it, and
-which shipped case is a start for one's own."""
+"""For each kind of case, by the table that only this kind has (searched in this order): what it is,
+the command that runs it, and the shipped case that a new one can be started from."""
 
 
 class CaseModel(BaseModel):
-    """What all kinds of cases have in common: no unknown keys, unchangeable, a title."""
+    """Base of all kinds of cases: immutable, with a title; unknown keys are refused."""
 
     model_config = CHECKS
     table: ClassVar[str]
-    """The table by which such a case is known, see ``_KINDS``."""
+    """The TOML table by which this kind of case is recognised, see ``_KINDS``."""
 
     title: str = ""
 
     @classmethod
     def read(cls, name: str | Path) -> Self:
-        """Read a case by the name of a shipped one or by the path of a TOML file.
+        """Read a case, given by the name of a shipped case or the path of a TOML file.
 
         Raises InputError if there is no such case, it is of another kind, it is not TOML, a key is
-        unknown (the nearest known one is suggested) or a value is out of its range.
+        unknown (the nearest known key is suggested) or a value is out of range.
         """
         wanted, _, start = _KINDS[cls.table]
         tables = read_tables(name, start)
@@ -74,7 +74,7 @@ class CaseModel(BaseModel):
 
     @classmethod
     def of(cls, case: CaseModel | str | Path) -> Self:
-        """The case itself, or the one of that name; InputError if it is of another kind."""
+        """Return a case as given, or read it by name; InputError if it is of another kind."""
         if isinstance(case, CaseModel) and not isinstance(case, cls):
             raise InputError(f"expected {_KINDS[cls.table][0]}, got {_KINDS[case.table][0]}")
         return case if isinstance(case, cls) else cls.read(str(case))
@@ -88,20 +88,20 @@ CaseType = TypeVar("CaseType", bound=CaseModel)
 
 
 def table_of_kind(tables: Mapping[str, Any]) -> str:
-    """The table that makes a case's kind, such as "lattice" or "experiment"; or ""."""
+    """The table that defines a case's kind, such as "lattice"; "" if there is none."""
     return next((name for name in _KINDS if name in tables), "")
 
 
 def shipped_cases(kind: str = "") -> dict[str, str]:
-    """Names and titles of the cases that come with the package: all, or those with a table."""
+    """Names and titles of the cases shipped with the package: all, or those of one kind."""
     found = {name: tomllib.loads(path.read_text("utf-8")) for name, path in _shipped().items()}
     return {n: str(t["title"]) for n, t in found.items() if kind in ("", table_of_kind(t))}
 
 
 def case_text(name: str) -> str:
-    """The TOML text of a shipped case, comments included: a start for one's own.
+    """The TOML text of a shipped case with its comments, as a template for a new case.
 
-    Raises InputError, with the nearest name, if there is none of that name.
+    Raises InputError, which suggests the nearest name, if no shipped case has this name.
     """
     known = _shipped()
     if name not in known:
@@ -110,13 +110,13 @@ def case_text(name: str) -> str:
 
 
 def shipped_solution(name: str) -> Path | None:
-    """Where the solution of a shipped case is kept, if one comes with the package."""
+    """Path of the solution of a shipped case; None if the package contains none."""
     path = Path(str(_SHIPPED / f"{name}.h5"))
     return path if path.is_file() else None
 
 
 def _shipped() -> dict[str, Path]:
-    """The files of shipped cases by their names, studies last."""
+    """The TOML files of the shipped cases, by case name; studies come last."""
     folder = Path(str(_SHIPPED))
     return {p.stem: p for where in ("", "studies") for p in sorted((folder / where).glob("*.toml"))}
 
@@ -124,8 +124,8 @@ def _shipped() -> dict[str, Path]:
 def read_tables(name: str | Path, start: str = "NAME") -> dict[str, Any]:
     """The tables of a shipped case (by its name) or of a TOML file (by its path).
 
-    ``start``: the shipped case that a missing file could begin as. Raises InputError if there is
-    no such case or file, or it isn't TOML.
+    ``start``: the shipped case that the error message for a missing file offers as a template.
+    Raises InputError if there is no such case or file, or it isn't TOML.
     """
     path = Path(name)
     if path.suffix == ".toml" or path.is_file() or (path.is_dir() and str(path) not in _shipped()):
@@ -135,7 +135,7 @@ def read_tables(name: str | Path, start: str = "NAME") -> dict[str, Any]:
 
 
 def _tables(path: Path) -> dict[str, Any]:
-    """What a TOML file holds; the mark that some editors put at its beginning is all right."""
+    """The content of a TOML file; a byte order mark at its beginning is accepted."""
     content = path.read_bytes()
     try:
         return tomllib.loads(content.decode("utf-8-sig"))
@@ -150,7 +150,7 @@ def _tables(path: Path) -> dict[str, Any]:
 
 
 def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) -> CaseType:
-    """The case that tables describe; ``name`` begins the message of an InputError."""
+    """Make a validated case from its tables; InputError, whose message begins with ``name``."""
     try:
         case = model.model_validate(dict(tables))
         require_types(tables, case)
@@ -162,9 +162,9 @@ def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) 
 
 
 def of_kind(kinds: Mapping[str, type[Any]], where: str, key: str = "") -> BeforeValidator:
-    """Turn a table, or its own table ``key``, into the dataclass that its ``kind`` names.
+    """Turn a table, or its sub-table ``key``, into the dataclass that its entry ``kind`` names.
 
-    The first of ``kinds`` without one. An InputError names an unknown kind or key by ``where``.
+    Without ``kind`` the first of ``kinds`` is used. ``where`` is the table's name in an InputError.
     """
 
     def choose(table: Any) -> Any:
@@ -189,13 +189,13 @@ def of_kind(kinds: Mapping[str, type[Any]], where: str, key: str = "") -> Before
 
 
 def with_kind(thing: object, kinds: Mapping[str, type[Any]]) -> dict[str, Any]:
-    """The table of which ``of_kind`` makes this thing again."""
+    """The table from which ``of_kind`` makes an equal object, with its ``kind``."""
     names = {cls: kind for kind, cls in kinds.items()}
     return {"kind": names.get(type(thing), type(thing).__name__), **to_plain(thing)}
 
 
 class Case(CaseModel):
-    """A virtual experiment: what is simulated, how it is imaged, how it is correlated; a twin."""
+    """A virtual experiment, or a twin: what is simulated, how it is imaged and correlated."""
 
     table = "experiment"
 
@@ -210,11 +210,11 @@ class Case(CaseModel):
     calibration: CalibrationTarget | None = None
 
     def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values, materials by their kind."""
+        """The case as plain JSON values; the material has its ``kind``."""
         content = super().plain()
         content["experiment"]["material"] = with_kind(self.experiment.material, MATERIALS)
         content["experiment"]["specimen"] = self.experiment.specimen.plain()
-        for name in ("tilt", "guided"):  # as before there were any: what is finished stays so
+        for name in ("tilt", "guided"):  # unset: keys of older, finished runs stay valid
             if not content["experiment"][name]:
                 del content["experiment"][name]
         if self.calibration is None:

@@ -1,6 +1,6 @@
-"""The design of a test, from a case to its report: what noise will leave uncertain, and what helps.
+"""The design of a test, from case to report: uncertainty expected from noise, and how to reduce it.
 
-A case is a virtual experiment's, and may have a table ``[design]``.
+A case has the tables of a virtual experiment, and may have a table ``[design]``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from modeharvest.validation.design_parameters import ModelStates
 
 
 class DesignCase(Case):
-    """A virtual experiment, and what its photographs are wanted for."""
+    """A virtual experiment, with the options of the design of its test."""
 
     table = "design"
 
@@ -29,7 +29,7 @@ class DesignCase(Case):
 
     @classmethod
     def read(cls, name: str | Path) -> Self:
-        """Read a design, or a virtual experiment, which is designed with the defaults."""
+        """Read a design case; a virtual experiment without ``[design]`` gets the defaults."""
         tables = read_tables(name, "paper-virtual")
         if table_of_kind(tables) == "experiment":
             return checked(cls, tables, name)
@@ -38,15 +38,15 @@ class DesignCase(Case):
 
 @dataclass(frozen=True)
 class DesignRun(StagedRun[DesignCase]):
-    """The work of a design."""
+    """Computes the design of a test and writes its report."""
 
     solution: Path | None = None
-    """A solution file instead of the case's shipped one, or of simulating."""
+    """A solution file, used instead of the case's shipped solution or a simulation."""
     source: str = "CASE"
     """The case's name, for the report."""
 
     def design(self) -> Design:
-        """What says how large errors will be; simulates the test unless its solution is known."""
+        """The design, which predicts errors; simulates the test unless its solution is known."""
         case, strains = self.case, self.case.experiment.strains
         strain, how = case.design.strain or strains[-1], (case.imaging, case.correlation)
         solution = self._solved() if case.design.pattern is None else None
@@ -54,7 +54,7 @@ class DesignRun(StagedRun[DesignCase]):
         return Design(case.experiment.specimen, *how, case.design, strain, solution, model)
 
     def _model(self, strain: float) -> ModelStates:
-        """The states of the case's model at all strains that are looked at, and derivatives."""
+        """The model's states and their derivatives at all strains that the design uses."""
         with requiring_dolfinx("the design for a model's parameters needs"):
             from modeharvest.fem.path.parametric import ParametricTest
         design, own = self.case.design, self.case.experiment
@@ -66,7 +66,7 @@ class DesignRun(StagedRun[DesignCase]):
                            design.force_sd)  # fmt: skip
 
     def all(self) -> dict[str, Any]:
-        """Leave summary and report; returns the content of ``summary.json``."""
+        """Write summary and report; returns the content of ``summary.json``."""
         from modeharvest.report.design import design_report
         from modeharvest.report.model import write_page
 
@@ -78,7 +78,7 @@ class DesignRun(StagedRun[DesignCase]):
         return summary
 
     def summary(self, design: Design) -> dict[str, Any]:
-        """The content of ``summary.json``: docs/how-to/design.md."""
+        """The content of ``summary.json``; its keys: docs/how-to/design.md."""
         setup, options, state = design.setup, design.options, design.state(design.setup)
         expected = design.expected(setup)
         varied = {x: [{"value": v, **asdict(e)} for v, e in design.varied(x)] for x in AXES}

@@ -1,17 +1,17 @@
-"""A virtual experiment from simulation to report, in stages that can be run apart and resumed.
+"""A virtual experiment from simulation to report, in stages that run separately and can be resumed.
 
 ::
 
-    solution.h5 solution.vtu    fem        what the finite elements found
-    images/                     image      speckle images, masks, truth
-    correlation/                correlate  one result for each image
-    whole_field/                measure    the whole displacement of each image, on a mesh
-    report.html summary.json    validate   how large the errors are, and why
-    stages.json timings.json               which stages are finished, and what they took
+    solution.h5 solution.vtu    fem        the finite element solution
+    images/                     image      speckle images, masks, true displacements
+    correlation/                correlate  one result for each deformed image
+    whole_field/                measure    whole displacement of each image, on a mesh
+    report.html summary.json    validate   size and causes of the errors
+    stages.json timings.json               which stages are finished, and their durations
 
-A stage whose inputs, options and code have not changed, and whose files are what it wrote, is
-not run again. Two runs of a case leave the same bytes in every file but ``timings.json``, and but
-``seconds`` of the whole displacement in ``summary.json``, with its digest.
+A stage is not run again if its inputs, options, code and files have not changed. Two runs of a
+case write identical files, except for ``timings.json``, for ``seconds`` of the whole displacement
+in ``summary.json``, and for the digest of that file.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ class Run(StagedRun[Case]):
     """The stages of a virtual experiment."""
 
     solution: Path | None = None
-    """A solution file to use instead of simulating."""
+    """A solution file (HDF5) to use instead of simulating."""
 
     def fem(self) -> Solution:
-        """Simulate the test; leaves ``solution.h5`` and, for ParaView, ``solution.vtu``.
+        """Simulate the test; writes ``solution.h5`` and, for ParaView, ``solution.vtu``.
 
-        Without dolfinx, a shipped case's own solution is taken instead; MissingDependencyError if
-        none of this case is shipped.
+        Without dolfinx, the solution shipped with the case is used instead; raises
+        MissingDependencyError if no solution of this case is shipped.
         """
         path, vtu = self.folder / "solution.h5", self.folder / "solution.vtu"
 
@@ -77,14 +77,14 @@ class Run(StagedRun[Case]):
         return Solution.read(path)
 
     def solved(self) -> Solution:
-        """The solution that was given, or else a simulated one.
+        """The given solution, or else the simulated one.
 
-        Raises InputError if the one given is of another experiment, or lacks one of its strains.
+        Raises InputError if a given solution is of another experiment, or lacks one of its strains.
         """
         return self.fem() if self.solution is None else self._solution()
 
     def image(self) -> ImageSet:
-        """Make images and truth of the solution's snapshots in ``images/``.
+        """Write images and true displacements of the solution's snapshots to ``images/``.
 
         Raises InputError if the solution is of another experiment, or lacks one of its strains
         although its simulation did not end early.
@@ -99,10 +99,10 @@ class Run(StagedRun[Case]):
         return ImageSet.read(folder)
 
     def correlate(self) -> dict[float, Result]:
-        """Correlate every deformed image with the reference; leaves ``correlation/``.
+        """Correlate every deformed image with the reference; writes ``correlation/``.
 
-        Raises InputError if the images were made of another experiment or with other options than
-        this case's.
+        Raises InputError if the images were made from another experiment or with other options
+        than those of this case.
         """
         images = self._images()
 
@@ -123,10 +123,10 @@ class Run(StagedRun[Case]):
         return self._results(images)
 
     def measure(self) -> dict[float, NodalResult]:
-        """Measure the whole displacement of every deformed image; leaves ``whole_field/``.
+        """Measure the whole displacement of every deformed image; writes ``whole_field/``.
 
-        Nothing where the case says not to. Raises InputError if images or results are not of this
-        case.
+        Does nothing if the case does not ask for it. Raises InputError if images or results do
+        not belong to this case.
         """
         options = self.case.whole_field
         if not options.measure:
@@ -142,9 +142,9 @@ class Run(StagedRun[Case]):
         return {strain: self._whole_fields.read(name_of(strain)) for strain in images.strains}
 
     def validate(self) -> dict[str, Any]:
-        """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
+        """Compare the results with the truth; writes ``report.html`` and ``summary.json``.
 
-        Raises InputError if the results are not of these images and this case.
+        Raises InputError if the results do not belong to these images and this case.
         """
         images, correlated = self._correlated()
         measured = self._measure_key(correlated)
@@ -165,8 +165,8 @@ class Run(StagedRun[Case]):
     def all(self) -> dict[str, Any]:
         """Run every stage that is not finished; returns the content of ``summary.json``.
 
-        Raises InputError at once, if another process works in the folder; at the end, if the
-        simulation did not reach all strains asked for: what it did reach is reported.
+        Raises InputError at once if another process works in the folder. Also raises it at the end,
+        after the report of the strains reached, if the simulation did not reach all strains.
         """
         with exclusive(self.folder):
             stages = ("image", "correlate", *("measure",) * self.case.whole_field.measure)
@@ -198,7 +198,7 @@ class Run(StagedRun[Case]):
         return stage_key([correlated, asdict(self.case.whole_field)], "fem", "imaging", "idic")
 
     def _correlated(self) -> tuple[ImageSet, str]:
-        """The images, and the key of their results; InputError without finished ones."""
+        """The images, and the key of their results; InputError if these are not finished."""
         images = self._images()
         correlated = self._correlate_key(images)
         if not self.is_finished("correlate", correlated):
@@ -209,7 +209,7 @@ class Run(StagedRun[Case]):
         return images, correlated
 
     def _report(self, images: ImageSet, page: Path) -> dict[str, Any]:
-        """Compare with the truth and write the report; returns the content of the summary."""
+        """Compare results with the truth, write the report; returns the content of the summary."""
         from modeharvest.report.experiment import (
             ExperimentData,
             experiment_figures,
@@ -221,8 +221,8 @@ class Run(StagedRun[Case]):
         is_whole = case.whole_field.measure
         measured = MeasuredExperiment(case.experiment, case.correlation, solution, images, results)
         strains = sorted(results)
-        # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's and
-        # has a core: more states at once than the others only take memory.
+        # Numbers are computed by numpy and numba, which release the GIL; drawing runs in Python and
+        # takes one core. More states at a time than the other cores would only take memory.
         with _brief_turns(), ThreadPoolExecutor(max(1, (os.cpu_count() or 2) - 1)) as threads:
 
             def of_each(work: Callable[..., T], *earlier: Sequence[Any]) -> Sequence[T]:
@@ -276,7 +276,7 @@ class Run(StagedRun[Case]):
         return simulate(self.case.experiment, self.progress)
 
     def shipped(self) -> Solution | None:
-        """The solution that comes with the package, if it is of this very experiment."""
+        """The solution shipped with the package if it is of exactly this experiment, else None."""
         for name in shipped_cases("experiment"):
             path = shipped_solution(name)
             if path is not None and Case.read(name).experiment == self.case.experiment:
@@ -284,7 +284,7 @@ class Run(StagedRun[Case]):
         return None
 
     def _solution(self) -> Solution:
-        """The solution that was given, or the folder's own; InputError if it isn't this case's."""
+        """The given solution, or that in the folder; InputError if it isn't of this case."""
         if self.solution is None:
             advice = "make it again with 'modeharvest fem', or give it by --solution"
             self.require_whole(self._solution_path, advice)
@@ -298,7 +298,7 @@ class Run(StagedRun[Case]):
         return self.solution or self.folder / "solution.h5"
 
     def _strains(self, solution: Solution) -> list[float]:
-        """The strains asked for that the solution has."""
+        """The specified strains that the solution contains."""
         have = sorted({s.nominal_strain for s in solution.snapshots})
         reached = self._reached(solution.info, have, self._solution_path)
         for strain in reached:
@@ -313,7 +313,7 @@ class Run(StagedRun[Case]):
     def _reached(
         self, info: Mapping[str, Any], have: Sequence[float], where: object
     ) -> list[float]:
-        """The strains asked for that there are; of one's own simulation that ended early, some."""
+        """The specified strains available: all, or fewer if this run's simulation ended early."""
         wanted, outcome = self.case.experiment.strains, _outcome(info)
         found = [e for e in wanted if any(abs(e - other) < 1e-9 for other in have)]
         if len(found) == len(wanted) or (found and self.solution is None and outcome != _COMPLETE):
@@ -328,7 +328,7 @@ class Run(StagedRun[Case]):
         return self.folder / "correlation" / f"result_{round(1e4 * strain):04d}.json"
 
     def _results(self, images: ImageSet) -> dict[float, Result]:
-        """Of the images, correlated again where the whole displacement made that possible."""
+        """Results by strain; of a repeated correlation where the whole displacement gave one."""
         paths, key = {e: self._result_path(e) for e in images.strains}, self._correlate_key(images)
         if self.case.whole_field.measure and self.is_finished("measure", self._measure_key(key)):
             again = {e: self._whole_fields.result_path(e) for e in images.strains}
@@ -338,7 +338,7 @@ class Run(StagedRun[Case]):
 
 @contextmanager
 def _brief_turns() -> Iterator[None]:
-    """Let no thread keep the GIL for long: by default each of many short kernels waits 5 ms."""
+    """Shorten the GIL's switch interval: at the default, each short kernel waits 5 ms."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.0005)
     try:
@@ -348,7 +348,7 @@ def _brief_turns() -> Iterator[None]:
 
 
 class _Awaited(Sequence[T]):
-    """Results of threads that may still be at work, waited for where they are used."""
+    """A sequence of results of threads; accessing one waits until it is computed."""
 
     def __init__(self, coming: Sequence[Future[T]]) -> None:
         self._coming = coming
@@ -363,13 +363,13 @@ class _Awaited(Sequence[T]):
 def require_same_experiment(info: Mapping[str, Any], experiment: Experiment, where: object) -> None:
     """Raise InputError if a solution's ``info`` says that it is of another experiment.
 
-    That of another solver, read from its mesh, says nothing of it and is believed.
+    The solution of another solver, read from its mesh, has no such entry and is accepted.
     """
     usual = Experiment().described()
     usual["specimen"] = asdict(Specimen())
     for table, values in experiment.described().items():
         for name, value in {**usual[table], **values}.items() if table in info else ():
-            # What an older solution does not say was not to be chosen when it was made.
+            # An option missing in an older solution did not exist then: its default applies.
             got = info[table].get(name, usual[table].get(name))
             if got != value:
                 raise InputError(
@@ -378,5 +378,5 @@ def require_same_experiment(info: Mapping[str, Any], experiment: Experiment, whe
 
 
 def _outcome(info: Mapping[str, Any]) -> str:
-    """How far a simulation went, in words."""
+    """How a simulation ended: "complete", or the reason why it ended early."""
     return str(info.get("outcome", _COMPLETE))

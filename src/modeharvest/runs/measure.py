@@ -1,17 +1,17 @@
-"""The whole displacement in images of any surface, speckled or plain: a folder to be resumed.
+"""Whole displacement in images of any surface, speckled or plain, in a folder that can be resumed.
 
 ::
 
-    mask.tif  mesh.h5                      prepare   the material, and the mesh of it
-    results/NAME.h5 NAME.vtu NAME.csv      NAME      what was measured in one deformed image, see
+    mask.tif  mesh.h5                      prepare   material mask, and its mesh
+    results/NAME.h5 NAME.vtu NAME.csv      NAME      results of one deformed image, described in
     results/NAME_u_mm.tif ...                        modeharvest.idic.finite_element.files
-    results/NAME_holes.csv                           the holes, where there is no speckle
-    gauges.csv  gauges_along.csv                     what gauges read, if any are named
+    results/NAME_holes.csv                           holes, if there is no speckle
+    gauges.csv  gauges_along.csv                     readings of the gauges, if any
     report.html  summary.json                        of all images
-    stages.json  timings.json                        which stages are finished, what they took
+    stages.json  timings.json                        finished stages, and their durations
 
-Lengths are in mm if the size of a pixel is given, else in px, which every file says. The origin is
-the middle of the image, x right, y up.
+Lengths are in mm if the pixel size is given, else in px; every file states the unit. The origin is
+the middle of the image, x points right, y up.
 """
 
 from __future__ import annotations
@@ -88,9 +88,9 @@ from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, ver
 from modeharvest.util.typed import picked
 
 _LEAST_PX = 1000
-"""Pixels that a mesh covers, at least: some four elements."""
+"""Smallest number of pixels that a mesh must cover: about four elements."""
 _OVERLAP = 0.01
-"""Part of its pixels that may lie in two elements of a mesh."""
+"""Largest fraction of a mesh's pixels that may lie in two elements."""
 _MESH_FORMAT = "modeharvest-mesh-1"
 
 
@@ -98,13 +98,13 @@ _MESH_FORMAT = "modeharvest-mesh-1"
 class MeasureCase:
     """Images of a speckled surface.
 
-    ``reference``, ``deformed``: files, the latter in the order of the test, wildcards allowed.
-    ``mask``: an image, not black on material of the reference; None to find it by its speckle.
-    ``pixel_size`` [mm]; None for lengths in px. ``mesh``: of the material, of T3 or T6 elements, a
-    file that meshio reads; None to make it from the mask. ``brightness``: degree of the polynomials
-    by which gain and offset of an image may vary, 0 to 6. ``gauges``: a TOML file of them, that the
-    report shows. ``sequence``: the files that the names
-    stand for, if they are of folders or videos; ``choice``: the command's options about them.
+    ``reference``, ``deformed``: image files; ``deformed`` in the order of the test, wildcards
+    allowed. ``mask``: an image that is not black on material of the reference; None to find the
+    material by its speckle. ``pixel_size`` [mm]; None for lengths in px. ``mesh``: file of a T3 or
+    T6 mesh of the material, readable by meshio; None to mesh the mask. ``brightness``: degree,
+    0 to 6, of the polynomials for gain and offset over an image. ``gauges``: a TOML file of
+    gauges for the report. ``sequence``: the files that the names stand for, if these are folders or
+    videos; ``choice``: the command's options for choosing among them.
     """
 
     reference: Path
@@ -121,20 +121,20 @@ class MeasureCase:
         Brightness(self.brightness, self.brightness)  # checks its degree
         if self.pixel_size is not None:
             require_within("expected a pixel size [mm]", self.pixel_size, 1e-9, 1e6)
-        named = () if self.sequence else self.files.values()  # what a folder holds may be damaged
+        named = () if self.sequence else self.files.values()  # files in a folder may be damaged
         for path in (self.reference, *named, self.mask, self.mesh, self.gauges):
             if path is not None:
                 require_file(path, "a file", "check its name")
 
     @property
     def files(self) -> dict[str, Path]:
-        """The deformed images by their names, in the order of the test."""
+        """The files of the deformed images, by image name, in the order of the test."""
         paths = self.sequence.deformed if self.sequence else named_files(Path(), self.deformed)
         return {path.stem: path for path in paths}
 
     @property
     def unit(self) -> str:
-        """Of lengths, "mm" or "px"."""
+        """The unit of lengths, "mm" or "px"."""
         return "px" if self.pixel_size is None else "mm"
 
 
@@ -144,7 +144,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     @cached_property
     def reference(self) -> Photograph:
-        """The reference; InputError if it shows no speckle."""
+        """The reference image; InputError if it shows no speckle."""
         given, reference = self._given_mask, read_reference(self.case.reference)
         if given is not None:
             names = str(self.case.reference), str(self.case.mask)
@@ -159,13 +159,13 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     @cached_property
     def plain(self) -> MaterialContours | None:
-        """The reference's contours where it has no speckle; None if it has, or is masked."""
+        """The reference's contours if it has no speckle; None if it has, or a mask is given."""
         of_images = self.case.mask is self.case.mesh is None
         return plain_surface(self.reference.image) if of_images else None
 
     @cached_property
     def grid(self) -> PixelGrid:
-        """Its pixels [mm or px]."""
+        """The pixel grid of the reference [mm or px]."""
         return PixelGrid.centred(*self.reference.shape, self.case.pixel_size or 1.0)
 
     @cached_property
@@ -176,7 +176,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     @cached_property
     def material(self) -> MeshedMaterial:
-        """The material; leaves ``mask.tif``, ``mesh.h5``."""
+        """The material's mask and mesh; writes ``mask.tif`` and ``mesh.h5``."""
         mask_path, mesh_path = self.folder / "mask.tif", self.folder / "mesh.h5"
 
         def work() -> tuple[Path, ...]:
@@ -198,7 +198,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         return Body(self.material.mesh)
 
     def _material(self) -> MeshedMaterial:
-        """What can be measured of the mask that is given, or is found by its speckle."""
+        """Mesh the measurable part of the given mask, or of the material found by speckle."""
         given, options, image = self._given_mask, FiniteElementOptions(), self.reference.image
         blank: tuple[str, ...] = ()
         if self.plain is not None:
@@ -209,9 +209,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         return found._replace(changes=(*blank, *found.changes))
 
     def _meshed(self, path: Path) -> MeshedMaterial:
-        """A mesh that is given, and what it covers of the mask, which is all of it if there is one.
+        """A given mesh without elements beside image or mask; no mask given: the pixels it covers.
 
-        InputError if that isn't on the image, or overlaps itself.
+        Raises InputError if the mesh isn't on the image or the mask, or its elements overlap.
         """
         mesh, unit = quadratic(plane_mesh(read_any_mesh(path), path)), self.case.unit
         warnings: tuple[str, ...] = ()
@@ -245,15 +245,15 @@ class MeasureRun(StagedRun[MeasureCase]):
         return MeshedMaterial(mesh, mask, warnings)
 
     def pair(self, name: str) -> ImagePair:
-        """The reference, a deformed image, and the mask."""
+        """The image pair of the reference and a deformed image, with the mask."""
         frame = read_frame(self.case.files[name], self.reference)
         images, is_plain = (self.reference.image, frame.image), self.plain is not None
         return ImagePair(*images, self.grid, self.material.mask, is_plain=is_plain)
 
     def results(self) -> Mapping[str, NodalResult]:
-        """Measure every image, each after the last one that could be; leaves ``results/``.
+        """Measure all images, each starting from the last one measured; writes ``results/``.
 
-        Raises InputError if none can.
+        Raises InputError if no image can be measured.
         """
         found, failed = self._found
         if not found:
@@ -262,10 +262,10 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     @cached_property
     def _found(self) -> tuple[Mapping[str, NodalResult], dict[str, str]]:
-        """What was measured, and why others could not be."""
+        """Results by image name, and for each failed image the reason."""
         files, key, keys = self.case.files, self._key, {}
         folder, given = self.folder / "results", Given(self.case.unit)
-        _ = self.material  # what is wrong with the reference is not a deformed image's fault
+        _ = self.material  # so that errors of the reference aren't reported for an image
         for name, path in files.items():
             keys[name] = key = digest([key, name, sha256_of(path)])
 
@@ -293,7 +293,7 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _measured(
         self, name: str, before: NodalResult | None, folder: Path
     ) -> tuple[NodalResult, *tuple[Path, ...]]:
-        """Measure an image; leaves tables of holes and dots where there is no speckle."""
+        """Measure an image; without speckle, also writes tables of its holes and dots."""
         pair, body = self.pair(name), self._body
         if self.plain is not None:
             path = str(self.case.files[name])
@@ -308,25 +308,25 @@ class MeasureRun(StagedRun[MeasureCase]):
         return (displacement_from(start, pair, body, light_degree=light, progress=self.progress),)
 
     def _with_roots(self) -> Iterator[tuple[str, NodalResult]]:
-        """Each image's displacement with the roots of its covariance."""
+        """Name and displacement of each image, with the square roots of its covariance."""
         for name in self.results():
             yield name, read_result(self.folder / f"results/{name}.h5", with_roots=True)
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
-        """(rows, cols) residual of one image [grey levels], NaN off the material."""
+        """(rows, cols) residual of one image [grey levels], NaN outside the material."""
         return residual(self.pair(name), result.displacement_on(), self.case.brightness)
 
     def picture(self, name: str) -> FloatImage:
-        """(rows, cols) one deformed image, from 0 black to 1 white."""
+        """(rows, cols) one deformed image, scaled from 0 (black) to 1 (white)."""
         image = read_frame(self.case.files[name], self.reference).image
         return np.asarray(image / np.float32(self.reference.full_scale))
 
     def all(self) -> dict[str, Any]:
-        """Do everything that is not finished; returns the content of ``summary.json``."""
+        """Run every stage that is not finished; returns the content of ``summary.json``."""
         with exclusive(self.folder):
             require_writable(self.folder)
             gauges = read_gauges(self.case.gauges) if self.case.gauges else ()
-            for gauge in gauges:  # one beside the material is known before anything is measured
+            for gauge in gauges:  # InputError before measuring, if one is beside the material
                 points_of(gauge, self.grid, self.material.mesh)
             results = self.results()
             summary = self._summary(results)
@@ -409,7 +409,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 def _mean_motion(result: NodalResult) -> dict[str, float]:
     """Mean strain along the material's x and y [-], tension positive, and rotation [degrees].
 
-    Of the affine motion nearest to the nodes' displacement, whose rotation is no strain.
+    They are those of the affine motion that fits the nodal displacements; rotation gives no strain.
     """
     points = result.mesh.nodes
     columns = np.column_stack([np.ones(len(points)), points])
@@ -427,11 +427,11 @@ def measure(
 ) -> dict[str, Any]:  # fmt: skip
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
 
-    ``deformed`` may also be folders and videos; ``choice`` among their frames; ``log`` of the
-    testing machine; ``gauges``: a TOML file of them, for the report.
+    ``deformed`` may also be folders and videos; ``choice``: which of their frames are measured;
+    ``log``: log of the testing machine; ``gauges``: a TOML file of gauges for the report.
 
-    Leaves its files in ``folder`` and returns what ``summary.json`` holds. InputError if an image,
-    the mask or the mesh can't be used.
+    Writes its files to ``folder`` and returns the content of ``summary.json``. Raises InputError if
+    an image, the mask or the mesh can't be used.
     """
     names, choice, log = tuple(map(str, deformed)), choice or FrameChoice(), log or LogTable()
     sequence = chosen_frames(

@@ -1,8 +1,8 @@
-"""Kernels compiled ahead of time: by children, while the finite elements leave a core idle.
+"""Kernels compiled ahead of time in child processes, while the finite elements leave a core idle.
 
-numba holds the interpreter while it compiles, so threads are no help. Each child does a small case
-of what comes later in the run and leaves its kernels on disk, where the run finds them. It is a
-courtesy: what a child does not get done is compiled where it is needed.
+numba holds the GIL while it compiles, so threads do not help. Each child process runs a small
+example of later stages, whose kernels are cached on disk, where the run finds them. This is
+optional: kernels that a child has not compiled in time are compiled when they are needed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _CASE = "paper-virtual"
 
 
 def _images() -> None:
-    """What the stage ``image`` compiles."""
+    """Run a small example that compiles the kernels of the stage ``image``."""
     case, solution = Case.read(_CASE), shipped_solution(_CASE)
     assert solution is not None
     spec = replace(case.imaging, pixel_size=0.1)
@@ -48,7 +48,7 @@ def _images() -> None:
 
 
 def _correlation() -> None:
-    """What the stages ``correlate`` and ``validate`` compile."""
+    """Run a small example that compiles the kernels of ``correlate`` and ``validate``."""
     case, rng = Case.read(_CASE), np.random.default_rng(0)
     grid, strain = PixelGrid.centred(444, 320, 0.05), case.experiment.strains[-1]
     f, mask = rng.random(grid.shape, np.float32), np.ones(grid.shape, np.bool_)
@@ -60,7 +60,7 @@ def _correlation() -> None:
 
 
 def _measurement() -> None:
-    """What the stage ``measure`` compiles beyond that."""
+    """Run a small example that compiles the further kernels of the stage ``measure``."""
     rng, grid = np.random.default_rng(0), PixelGrid.centred(200, 240, 0.05)
     f = gaussian_filter(rng.random(grid.shape, np.float32), 2.0)
     mask = np.ones(grid.shape, np.bool_)
@@ -75,19 +75,19 @@ _PARTS: dict[str, tuple[Callable[[], None], Callable[..., object]]] = {
     "correlate": (_correlation, accumulate),
     "measure": (_measurement, accumulate_elements),
 }
-"""By stage, a child's work, and a kernel beside which it notes that it is done."""
+"""By stage: the example that a child runs, and the kernel in whose cache folder its stamp is."""
 _CHAINS = ("image",), ("correlate", "measure")
-"""Each child's stages: what measures calls kernels of both others, and finds them compiled."""
+"""Stages of each child: ``measure`` calls kernels of the other two, and finds them compiled."""
 
 
 def _stamp(stage: str) -> Path | None:
-    """The note; deleted with the kernels by who deletes ``*.nbi``. None without a cache."""
+    """A stage's stamp file, ``*.nbi`` so that it is deleted with the kernels; None: no cache."""
     folder = cached_in(_PARTS[stage][1])
     return None if folder is None else folder / f"precompiled-{sources()}.nbi"
 
 
 def stamps() -> dict[str, float]:
-    """By stage, what compiling its kernels ahead took [s]; 0 where that hasn't been done."""
+    """By stage, how long compiling its kernels ahead took [s]; 0 if not done."""
     found = {stage: _stamp(stage) for stage in _PARTS}
     texts = {s: p.read_text() if p is not None and p.exists() else "" for s, p in found.items()}
     return {stage: float(text or 0.0) for stage, text in texts.items()}
@@ -99,12 +99,12 @@ def _is_missing(stage: str) -> bool:
 
 @dataclass(frozen=True)
 class Precompilation:
-    """Children at work, by the stage that needs what they compile."""
+    """Child processes, by the stage whose kernels they compile."""
 
     children: dict[str, subprocess.Popen[bytes]]
 
     def wait(self, stage: str, progress: Progress = silent) -> None:
-        """Wait for the kernels of a stage: two who compile the same are no faster than one."""
+        """Wait for a stage's kernels: compiling them a second time would not be faster."""
         child = self.children.get(stage)
         while child is not None and child.poll() is None and _is_missing(stage):
             progress(0, 1, "compile kernels, once")
@@ -113,7 +113,7 @@ class Precompilation:
 
 @contextmanager
 def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
-    """Start children for the stages whose kernels are not there yet; none is left in the end."""
+    """Start child processes for stages whose kernels are missing; stops them all on exit."""
     children: dict[str, subprocess.Popen[bytes]] = {}
     missing = set(filter(_is_missing, stages))
     if is_alone() and (os.cpu_count() or 1) > 1:
@@ -132,9 +132,9 @@ def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
 
 
 def _main(stages: list[str]) -> None:
-    gc.disable()  # a twentieth of the time, for 60 MB
+    gc.disable()  # saves a twentieth of the time, for 60 MB more memory
     if hasattr(os, "nice"):
-        os.nice(10)  # the finite elements go first
+        os.nice(10)  # the finite elements have priority
     for stage in stages:
         begin = time.perf_counter()
         _PARTS[stage][0]()

@@ -1,7 +1,7 @@
 """A study from its case to its report, in one folder in which an interrupted run is continued.
 
-Its files: docs/how-to/studies.md. Its TOML file has the tables of a virtual experiment and
-``[study]``: a kind ("robustness", "noise", "systematic", "modes", "resolution"), its options.
+For its files see docs/how-to/studies.md. Its TOML file has the tables of a virtual experiment and
+``[study]``: a kind ("robustness", "noise", "systematic", "modes", "resolution") and its options.
 In Python: ``StudyCase(study=RobustnessStudy(initial_guesses=20, radius=0.2))``.
 """
 
@@ -47,11 +47,11 @@ KINDS: dict[str, type[Any]] = {
     "modes": MeasuredModesStudy,
 }
 _QUICK = 2.0
-"""A quick study's pixels are that much larger."""
+"""Factor by which the pixel size of a quick study is larger."""
 
 
 class StudyCase(Case):
-    """A question, and the virtual experiment that it is asked of."""
+    """A study's options, and the virtual experiment that is studied."""
 
     table = "study"
 
@@ -59,7 +59,7 @@ class StudyCase(Case):
 
     @classmethod
     def read(cls, name: str | Path) -> Self:
-        """Read a study as every other case; it has to ask something."""
+        """Read a study like any other case; InputError if it has no table ``[study]``."""
         if "study" not in read_tables(name, "noise"):
             raise InputError(
                 f"{name}: expected a table [study] with a kind among {list(KINDS)}, got none; a "
@@ -84,16 +84,16 @@ class StudyCase(Case):
 
     @property
     def kind(self) -> str:
-        """The name of the question."""
+        """The kind of study, such as "noise"."""
         return next(name for name, kind in KINDS.items() if isinstance(self.study, kind))
 
     def quick(self) -> StudyCase:
-        """A first look: fewer cases, on images of a quarter of the pixels."""
+        """A quick version: fewer cases, on images with a quarter of the pixels."""
         imaging = replace(self.imaging, pixel_size=_QUICK * self.imaging.pixel_size)
         return self.model_copy(update={"study": self.study.quick(), "imaging": imaging})
 
     def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values, the study and materials by their kinds."""
+        """The case as plain JSON values; study and material have their ``kind``."""
         return {**super().plain(), "study": with_kind(self.study, KINDS)}
 
 
@@ -104,36 +104,36 @@ FINDINGS: dict[type[Any], Callable[[Any, str], Findings]] = {
     ResolutionStudy: report_resolution,
     MeasuredModesStudy: report_modes,
 }
-"""For each kind of study what draws its analysis, with the seeds in words."""
+"""For each kind of study, the function that reports its analysis, given a text on the seeds."""
 
 
 @dataclass(frozen=True)
 class StudyAnalysis(StagedRun[StudyCase]):
-    """A study's work: images, cases run by ``workers``, findings."""
+    """Runs a study: makes images, runs its cases with ``workers``, reports findings."""
 
     workers: Workers = field(default_factory=Workers)
     solution: Path | None = None
-    """A solution file to use instead of simulating."""
+    """A solution file (HDF5) to use instead of simulating."""
     command: str = "modeharvest study STUDY --out DIR"
-    """What makes the report again."""
+    """The command that reproduces the report, shown in it."""
 
     def pair_spec(self) -> ImagePairSpec:
-        """What is measured."""
+        """Specification of the image pair that is measured."""
         case = self.case
         return ImagePairSpec(case.experiment, case.imaging, case.correlation, self._solution)
 
     def _solution(self) -> Solution:
-        """The exact displacements, simulated or read from a file; leaves ``solution.h5``."""
+        """The exact displacements, simulated or read from a file; writes ``solution.h5``."""
         solution = Run(self.case, self.folder, self.progress, self.solution).solved()
         if self.solution is not None:
             solution.write(self.folder / "solution.h5")
         return solution
 
     def all(self) -> dict[str, Any]:
-        """Run what is missing of the study; returns the content of ``summary.json``.
+        """Run all unfinished parts of the study; returns the content of ``summary.json``.
 
-        Raises InputError if no case succeeded, the folder can't be written to, holds anything else
-        or is another process's, a scheduler is not there, or its workers can't do the work.
+        Raises InputError if no case succeeded; the folder can't be written to, holds other files or
+        is used by another process; a scheduler can't be reached, or its workers can't do the work.
         """
         folder, study = self.folder.resolve(), self.case.study
         with exclusive(folder):
@@ -156,7 +156,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
     def _write_report(
         self, campaign: Campaign, table: pd.DataFrame, findings: Findings
     ) -> dict[str, Any]:
-        """Leave tables, ``summary.json`` and ``report.html``."""
+        """Write tables, ``summary.json`` and ``report.html``."""
         tables = [*findings.tables, *findings.attachments]
         files = {
             "table.csv": "every case: its values, error, result",
@@ -195,11 +195,11 @@ class StudyAnalysis(StagedRun[StudyCase]):
 
 
 def _claim(folder: Path, kind: str) -> None:
-    """Take a folder for a kind of study; InputError if it holds anything else."""
+    """Mark a folder as that of a kind of study; InputError if it holds anything else."""
     path, wanted = folder / "study.json", f"a {kind} study"
     holds = wanted
     if path.is_file():
-        with suppress(InputError, KeyError, TypeError):  # a damaged one says nothing
+        with suppress(InputError, KeyError, TypeError):  # ignored if damaged
             holds = f"a {read_json(path)['kind']} study"
     elif (folder / "summary.json").exists():
         holds = "something that is no study (it has a summary.json, but no study.json)"

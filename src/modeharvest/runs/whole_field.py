@@ -1,4 +1,4 @@
-"""The whole displacement as a stage of a run: how it is measured, and the files."""
+"""The whole displacement as a stage of a run: options, measurement, and files."""
 
 from __future__ import annotations
 
@@ -38,54 +38,54 @@ from modeharvest.validation.truth import Comparison
 from modeharvest.validation.whole_field import WholeFieldSummary, compare_whole
 
 BYTES_PER_PIXEL = 420.0
-"""Of memory while an image is measured: 1.6 GB were measured for one of 4 Mpx."""
+"""Memory needed to measure an image [bytes/px]; from 1.6 GB measured for an image of 4 Mpx."""
 _REFUSED = 2
-"""Exit code for an InputError."""
+"""Exit code of a child process after an InputError."""
 
 
 @dataclass(frozen=True)
 class WholeFieldOptions:
-    """How the whole displacement is measured, from an ansatz' result, on a mesh of the material."""
+    """How the whole displacement is measured on a mesh of the material, from the ansatz' result."""
 
     measure: bool = False
-    """Whether it is measured at all: that costs more than the rest of the run."""
+    """Whether the whole displacement is measured; this takes longer than the rest of the run."""
     element_px: float = 24.0
     """Edge length of the elements [px]."""
     edge_element_px: float = 12.0
-    """The same along edges."""
+    """Edge length of the elements along edges of the material [px]."""
     cutoff_px: float | None = None
-    """Cut-off wavelength of the regularisation [px]; None: found from the images."""
+    """Cut-off wavelength of the regularisation [px]; None to find it from the images."""
 
     def __post_init__(self) -> None:
         self.on_mesh()
 
     def on_mesh(self, law: Law | None = None) -> FiniteElementOptions:
-        """The engine's options."""
+        """The options of the finite element measurement, with a material law if given."""
         sizes = self.element_px, self.edge_element_px
         return FiniteElementOptions(*sizes, cutoff_px=self.cutoff_px, law=law)
 
 
 def change_of(how: WholeFieldOptions, measure: bool | None) -> dict[str, WholeFieldOptions]:
-    """What changes in a case that is to measure or not; nothing for None, as the case says."""
+    """Changes to a case so that it measures or not; none for None, which keeps its own choice."""
     return {} if measure is None else {"whole_field": replace(how, measure=measure)}
 
 
 @dataclass(frozen=True)
 class VirtualWholeFieldOptions(WholeFieldOptions):
-    """How it is measured in a virtual experiment, of which more is known."""
+    """Options of the whole displacement of a virtual experiment, whose exact images are known."""
 
     camera: bool = True
-    """Whether in the images as a camera gives them, quantised, or in the exact ones."""
+    """Whether to measure in the camera's quantised images, or else in the exact ones."""
     material_law: bool = False
-    """Whether to regularise by the equilibrium of the experiment's own material."""
+    """Whether to regularise by the equilibrium of the experiment's material."""
 
     @property
     def of_photographs(self) -> WholeFieldOptions:
-        """The options that photographs have, too."""
+        """Those of the options that photographs also have."""
         return WholeFieldOptions(*(getattr(self, f.name) for f in fields(WholeFieldOptions)))
 
     def of(self, experiment: Experiment, pixel_size: float) -> FiniteElementOptions:
-        """The engine's options for an experiment, whose two ends along x are loaded."""
+        """Finite element options for an experiment; its two ends along x are loaded."""
         if not self.material_law:
             return self.on_mesh()
         on_ends = partial(_on_ends, experiment.specimen.half_size[0], pixel_size)
@@ -93,13 +93,13 @@ class VirtualWholeFieldOptions(WholeFieldOptions):
 
 
 def _on_ends(half_length: float, within: float, points: FloatArray) -> BoolArray:
-    """(n,) True for points on the two ends of a specimen along x, to within a length [mm]."""
+    """(n,) True for points within a distance [mm] of the two ends of a specimen along x."""
     return np.asarray(np.abs(np.abs(points[:, 0]) - half_length) < within)
 
 
 @contextmanager
 def with_remedy(of: str) -> Iterator[None]:
-    """Say in an InputError whose whole displacement it is about, and how to do without."""
+    """Add to an InputError which whole displacement failed, and how to run without it."""
     try:
         yield
     except InputError as error:
@@ -110,13 +110,13 @@ def with_remedy(of: str) -> Iterator[None]:
 
 
 def name_of(strain: float) -> str:
-    """Of the files of a virtual experiment at a strain."""
+    """File name, without extension, of the whole displacement at a nominal strain [-]."""
     return f"displacement_{round(1e4 * strain):04d}"
 
 
 @dataclass(frozen=True)
 class WholeFields:
-    """The files of whole displacements in a folder, by the names of images."""
+    """The files of whole displacements in a folder, named by image."""
 
     folder: Path
 
@@ -125,11 +125,11 @@ class WholeFields:
         return self.folder / f"{name}.h5"
 
     def result_path(self, strain: float) -> Path:
-        """The JSON file of a correlation that took the place of one that had gone astray."""
+        """The JSON file of the correlation that replaces one that had failed."""
         return self.folder / f"{name_of(strain)}_result.json"
 
     def write(self, name: str, found: NodalResult, given: Given) -> tuple[Path, Path]:
-        """Write what was found in an image; returns the files."""
+        """Write the whole displacement of an image; returns the HDF5 and the VTU file."""
         path = self.path(name)
         make_folder(self.folder)
         write_result(path, found, given=given)
@@ -140,10 +140,10 @@ class WholeFields:
         self, images: ImageSet, results: Mapping[float, Result], options: VirtualWholeFieldOptions,
         correlation: SquareLatticeOptions, experiment: Experiment, progress: Progress,
     ) -> list[Path]:  # fmt: skip
-        """Measure every deformed image of a virtual experiment, from its correlation's result.
+        """Measure every deformed image of a virtual experiment, starting from its correlation.
 
-        Where that had gone astray, it is correlated again from what was measured. Images are shared
-        out among processes, as many as there are cores and memory for.
+        If the correlation had failed, it is repeated from the measured displacement. The images are
+        distributed over processes, as many as cores and memory allow. Returns the files.
         """
         how, mask = options.of(experiment, images.grid.pixel_size), images.mask()
         most = min(get_num_threads() if is_alone() else 1, len(images.strains))
@@ -151,7 +151,7 @@ class WholeFields:
         with _children(count - 1) as children:
             with with_remedy("mesh of the material"):
                 body = how.body(mask, images.grid)
-            # The last state takes longest, and its progress is seen.
+            # The last state takes longest; it is measured here, so that its progress is shown.
             first, *others = (
                 partial(
                     _measure, self, images.folder, body, how, options.camera, correlation,
@@ -161,7 +161,7 @@ class WholeFields:
             )  # fmt: skip
             for child, share in zip(children, others, strict=True):
                 assert child.stdin
-                with suppress(BrokenPipeError), child.stdin as to:  # why is seen in the end
+                with suppress(BrokenPipeError), child.stdin as to:  # reported at the end
                     pickle.dump(share, to)
             first(progress)
         stems = [self.path(name_of(strain)) for strain in images.strains]
@@ -171,7 +171,7 @@ class WholeFields:
     def compared(
         self, comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
     ) -> tuple[WholeField, WholeFieldSummary]:
-        """The k-th of a virtual experiment, refitted and set against the truth."""
+        """The k-th whole displacement with the ansatz refitted to it, and its errors."""
         known, name = comparisons[k], name_of(comparisons[k].strain)
         found, true, fit = self.read(name), known.displacement, known.result
         refit = refitted(found, fit.ansatz, fit.unknowns, known.mask)
@@ -187,7 +187,7 @@ def _measure(
     files: WholeFields, folder: Path, body: Body, how: FiniteElementOptions, camera: bool,
     correlation: SquareLatticeOptions, results: Mapping[float, Result], progress: Progress,
 ) -> None:  # fmt: skip
-    """Measure images in a folder one after another, from their correlations, by strain."""
+    """Measure the images of a folder in turn, each from its correlation in ``results``."""
     images, law = ImageSet.read(folder), None if how.law is None else how.law.material
 
     def say(of: str, done: float, total: float, what: str) -> None:
@@ -210,9 +210,9 @@ def _measure(
 
 @contextmanager
 def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes that do the share, pickled, that they are given; none is left in the end.
+    """Child processes that run the pickled work sent to their stdin; all are stopped on exit.
 
-    InputError as it comes from one, or if one was killed; RuntimeError if one fails otherwise.
+    Passes on an InputError of a child; InputError if one was killed; RuntimeError if it fails else.
     """
     command, pipe = [sys.executable, "-P", "-m", "modeharvest.runs.whole_field"], subprocess.PIPE
     with ExitStack() as stack:

@@ -1,3 +1,3 @@
-"""What every package needs and none of the science: files, stages, options, progress."""
+"""Tools of every package that contain no mechanics or imaging: files, stages, options, progress."""
 
 __version__ = "0.1.0"

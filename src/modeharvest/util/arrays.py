@@ -1,4 +1,4 @@
-"""Names for the kinds of arrays that annotations speak of."""
+"""Names of array types, for annotations."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,9 +1,9 @@
-"""Parsers that can crash, run in a process apart: ``python child.py KIND FILE TARGET``.
+"""Parsers that can crash, run in a separate process: ``python child.py KIND FILE TARGET``.
 
-scipy reads MAT files, and meshio meshes, as the file says: a damaged one makes scipy read where
-there is no memory of its own, which ends the process, and meshio fill the memory. What is read goes
-to TARGET, an NPZ of numbers and texts, with their names as ``names``. Imports nothing of
-modeharvest, to start fast.
+scipy (MAT files) and meshio (meshes) trust the sizes that a file declares. A damaged file can make
+scipy read outside its memory, which ends the process, and meshio fill the memory. The content goes
+to TARGET, an NPZ file of numbers and texts, whose names are in its array ``names``. Imports nothing
+of modeharvest, to start fast.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 BASE_BYTES, BYTES_PER_BYTE = 1e9, 2000.0
-"""Memory that reading a file may take beside what is taken already: no format packs closer."""
+"""Additional memory allowed [bytes], and per byte of the file; no format compresses further."""
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
@@ -62,11 +62,11 @@ def convert(kind: str, path: str, target: str) -> str:
     output = StringIO()
     try:
         with warnings.catch_warnings(), redirect_stdout(output), redirect_stderr(output):
-            warnings.simplefilter("ignore")  # what is doubtful is left out below
+            warnings.simplefilter("ignore")  # doubtful content is left out below
             found = {name: np.asarray(values) for name, values in KINDS[kind](path).items()}
         kept = {name: array for name, array in found.items() if array.dtype.kind in "fiubU"}
         np.savez(target, *kept.values(), names=np.array(list(kept), dtype=np.str_))
-    except (Exception, SystemExit) as error:  # they raise anything, print why, and may exit
+    except (Exception, SystemExit) as error:  # parsers raise any type, print the cause, may exit
         if isinstance(error, MemoryError):
             return "it declares more numbers than a file of its size can hold"
         return " ".join((output.getvalue() or str(error)).split()) or type(error).__name__
@@ -74,7 +74,7 @@ def convert(kind: str, path: str, target: str) -> str:
 
 
 def limit_memory(path: str) -> None:
-    """Where the system can, let wild allocations fail instead of filling the memory."""
+    """Limit this process's memory (Linux only), so that excessive allocations fail."""
     try:
         import resource
 
@@ -87,7 +87,7 @@ def limit_memory(path: str) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the module says; the exit code, after a line on stderr if it isn't 0."""
+    """Convert a file as the module describes; returns 0, or 1 with the cause on stderr."""
     kind, path, target = arguments
     limit_memory(path)
     failure = convert(kind, path, target)

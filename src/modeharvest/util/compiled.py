@@ -1,4 +1,4 @@
-"""numba's compiler behind a typed face: a decorated function keeps its signature."""
+"""A typed wrapper of numba's compiler: a decorated function keeps its signature."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _kept = True
 def compiled(
     *, inner: bool = False, inline: bool = False, relaxed: bool = False
 ) -> Callable[[F], F]:
-    """Compile a kernel at its first call; the machine code is cached on disk, if that is allowed.
+    """Compile a kernel at its first call; the machine code is cached on disk where possible.
 
-    ``inner``: for kernels only, without what Python needs to call it. ``inline``: the same, and put
-    into their code. ``relaxed``: let the compiler reorder sums and divide as numpy does; by default
-    floating-point arithmetic is strict, and division by zero an error.
+    ``inner``: callable from other kernels only, without Python's wrapper. ``inline``: the same, and
+    inlined in their code. ``relaxed``: let the compiler reorder sums and divide as numpy does; by
+    default floating-point arithmetic is strict, and division by zero raises an error.
     """
     options: dict[str, Any] = {"forceinline": inline, "nogil": True, "no_cfunc_wrapper": True}
     options["no_cpython_wrapper"] = inner or inline
@@ -51,9 +51,9 @@ def compiled(
 
 
 def _for_types(kernel: Any) -> Any:
-    """Have a kernel compiled once for a type, not also for a number that a calling kernel names.
+    """Compile a kernel once for each type, and not again for literal values in a calling kernel.
 
-    Where the method of numba's that knows a caller's arguments is not found, it stays as it is.
+    The kernel is returned unchanged if this version of numba lacks ``get_call_template``.
     """
     template, of = getattr(kernel, "get_call_template", None), cast(Any, numba.types).unliteral
     if template is not None:
@@ -66,10 +66,10 @@ def _for_types(kernel: Any) -> Any:
 
 
 def _stamped(kernel: Any) -> Any:
-    """Have a kept kernel compiled anew when one that it calls has changed, too.
+    """Recompile a cached kernel also when the file of a kernel that it calls has changed.
 
-    numba looks at the kernel's own file only. What it compares is no public part of it: where that
-    is not found, numba's own behaviour is left.
+    numba by itself checks the kernel's own file only. The attributes used are private to numba: if
+    they are not found, numba's behaviour is left unchanged.
     """
     index = cast(Any, getattr(getattr(kernel, "_cache", None), "_cache_file", None))
     if index is not None and hasattr(index, "_source_stamp"):
@@ -83,7 +83,7 @@ _IMPORTED = re.compile(r"^from modeharvest\.([\w.]+) import", re.MULTILINE)
 
 @cache
 def _read_by(path: Path) -> tuple[Path, ...]:
-    """The files of kernels that a file imports from, directly or not, and itself."""
+    """All files with kernels that a file imports, directly or indirectly, and itself."""
     found, waiting = {path}, [path]
     while waiting:
         for name in _IMPORTED.findall(waiting.pop().read_text("utf-8")):
@@ -105,7 +105,7 @@ def _digest(*paths: Path) -> str:
 
 
 def sources() -> str:
-    """A short text that differs for other kernels, another numba, or another processor."""
+    """Digest of the kernels' sources, the versions of numba and Python, and the processor."""
     folders = [_PACKAGE / name for name in ("util", "imaging", "idic")]
     files = [path for folder in folders for path in folder.rglob("*.py")]
     host = numba.__version__, llvmlite.binding.get_host_cpu_name(), sys.version
@@ -114,21 +114,21 @@ def sources() -> str:
 
 
 def cached_in(kernel: Callable[..., object]) -> Path | None:
-    """The folder that a kernel is kept in; None if it is not."""
+    """The folder in which a kernel is cached; None if it is not cached."""
     stats = getattr(kernel, "stats", None)
     return Path(stats.cache_path) if stats is not None and stats.cache_path else None
 
 
 def is_cached() -> bool:
-    """Whether compiled kernels are found again by the next process."""
+    """Whether compiled kernels are cached on disk, for use by later processes."""
     return _kept
 
 
 def readable(values: NDArray[Any]) -> NDArray[Any]:
-    """Show an array to kernels: contiguous, aligned and read-only, copied only where it isn't.
+    """A contiguous, aligned, read-only view of an array for kernels, or a copy where needed.
 
     Kernels are compiled for the types of their arguments, and layout and writability belong to
-    an array's type. Everybody's arrays can be made read-only, so that one compilation serves all.
+    an array's type. Any array can be viewed read-only, so that one compilation serves all.
     """
     view = np.require(values, requirements=["C_CONTIGUOUS", "ALIGNED"]).view()
     view.flags.writeable = False
@@ -138,8 +138,8 @@ def readable(values: NDArray[Any]) -> NDArray[Any]:
 def in_parallel(kernel: Callable[..., None], *arguments: Any) -> None:
     """Call ``kernel(*arguments, k, count)``, k = 0 ... count - 1, on as many threads as numba has.
 
-    The kernels share out their work themselves, every count-th part to one thread: numba's own
-    ``prange`` takes three times as long to compile.
+    Each call does every count-th part of the work, starting with part k. numba's own ``prange``
+    takes three times as long to compile.
     """
     count = numba.get_num_threads()
     if count == 1:

@@ -1,13 +1,13 @@
 """Reference elements T3, T6, Q4, Q8 and Q9: nodes, shape functions, polynomials; sums over nodes.
 
-An element is its nodes and the monomials it spans; everything else follows. Over an element
-every field (position, displacement) is one polynomial in the local coordinates (xi, eta), kept
-as nine coefficients in the order
+An element is defined by its nodes and the monomials that it spans. Over an element every field
+(position, displacement) is one polynomial in the local coordinates (xi, eta), stored as nine
+coefficients in the order
 
     1, xi, eta, xi^2, xi eta, eta^2, xi^2 eta, xi eta^2, xi^2 eta^2,
 
-so that all element types share the same kernels. Triangles live on xi, eta >= 0,
-xi + eta <= 1; quadrilaterals on -1 <= xi, eta <= 1. Node order: see modeharvest.fem.field.
+so that all element types share the same kernels. Triangles occupy xi, eta >= 0,
+xi + eta <= 1; quadrilaterals -1 <= xi, eta <= 1. Node order: see modeharvest.fem.field.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0],
 
 @dataclass(frozen=True, eq=False)
 class ReferenceElement:
-    """One element type."""
+    """An element type: its reference domain, nodes and shape functions."""
 
     triangular: bool
-    """Whether the reference domain is the triangle (else the square)."""
+    """Whether the reference domain is the triangle; otherwise it is the square."""
     nodes: FloatArray
     """(k, 2) local coordinates (xi, eta) of the nodes [-]."""
     monomials: tuple[int, ...]
@@ -43,12 +43,12 @@ class ReferenceElement:
     def __post_init__(self) -> None:
         full = np.zeros((9, len(self.nodes)))
         full[list(self.monomials)] = np.linalg.inv(monomials(self.nodes)[:, self.monomials])
-        # The exact values are multiples of 1/4; the inversion may leave rounding behind.
+        # The exact values are multiples of 1/4; rounding errors of the inversion are removed.
         object.__setattr__(self, "coefficients", np.round(full * 4.0) / 4.0)
 
     @property
     def middle(self) -> float:
-        """Both local coordinates of the reference domain's middle."""
+        """Value of both local coordinates, xi and eta, at the reference domain's centre."""
         return 1.0 / 3.0 if self.triangular else 0.0
 
 
@@ -100,14 +100,14 @@ def shape_gradients(name: str, xi: ArrayLike) -> FloatArray:
 
 
 def polynomials(name: str, cells: IntArray, nodal: FloatArray) -> FloatArray:
-    """(m, c, 9) coefficients, over each cell (m, k), of a nodal field (n, c)."""
+    """(m, c, 9) coefficients, over each cell (m, k), of a field (n, c) given at nodes."""
     per_cell = np.ascontiguousarray(nodal[cells].transpose(0, 2, 1), dtype=np.float64)
     flat = per_cell.reshape(-1, cells.shape[1]) @ reference_element(name).coefficients.T
     return flat.reshape(len(cells), nodal.shape[1], 9)
 
 
 def nodal_sums(count: int, nodes: IntArray, values: FloatArray) -> FloatArray:
-    """(count, s) sums of values (m, k, s) over the nodes (m, k) that they belong to."""
+    """(count, s) sum at each node of the elements' values (m, k, s) at their nodes (m, k)."""
     flat = nodes.ravel()
     ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (count, flat.size))
     return np.asarray(ones @ values.reshape(flat.size, values.shape[2]))

@@ -1,4 +1,4 @@
-"""The two ways a run ends early, apart from a fault in the program itself."""
+"""Exceptions that end a run early for a cause outside the program: input, or a missing library."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 
 class InputError(ValueError):
-    """What the user gave can't be used; the message is one line that says what to do.
+    """The user's input can't be used; the message is one line that says what to do.
 
-    Write it as *expected, got, where, what to do*. The command line prints it without a
+    Its parts are *expected, got, where, what to do*. The command line prints it without a
     traceback and exits with code 2.
     """
 
@@ -18,7 +18,7 @@ class InputError(ValueError):
 def require_within(
     what: str, value: float, low: float, high: float = math.inf, *, above: bool = False
 ) -> None:
-    """Raise InputError unless low <= value <= high, finite; ``above``: unless it is above low.
+    """Raise InputError unless value is finite, low <= value <= high; ``above``: low < value.
 
     ``what`` begins the message, for example "sensor: expected a gain".
     """
@@ -33,11 +33,11 @@ def require_within(
 
 
 class WriteError(InputError):
-    """A file can't be written, as on a full disk: no fault of what was given, so not its result."""
+    """A file can't be written (full disk, for example); not caused by the input's content."""
 
 
 class SingularMatrixError(InputError, ArithmeticError):
-    """What was given determines no solution; the message names the library that found so."""
+    """The input does not determine all unknowns; the message names the library that failed."""
 
     def __init__(self, found: str) -> None:
         super().__init__(
@@ -51,7 +51,7 @@ class MissingDependencyError(ImportError):
 
 
 def dolfinx_missing(what: str) -> MissingDependencyError:
-    """The error for ``what`` needs dolfinx where there is none, and how to get it."""
+    """The error for a missing dolfinx; ``what`` begins its message ("the design needs")."""
     return MissingDependencyError(
         f"{what} dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda install -c "
         "conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
@@ -61,7 +61,7 @@ def dolfinx_missing(what: str) -> MissingDependencyError:
 
 @contextmanager
 def requiring_dolfinx(what: str) -> Iterator[None]:
-    """Have an import that fails in the block end with what :func:`dolfinx_missing` says."""
+    """Turn a failed import in the block into the error of :func:`dolfinx_missing`."""
     try:
         yield
     except ImportError as error:

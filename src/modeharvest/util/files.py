@@ -1,9 +1,9 @@
-"""Reading and writing files: every fault of a file in one line, every new file whole or absent.
+"""Reading and writing files: errors are reported in one line; new files are complete or absent.
 
-The libraries that read formats raise anything for a damaged file. What a reader does with them
-stands in a ``with reading(...)`` block, which turns all of it into InputError. HDF5 is opened by
-:func:`open_hdf5`, which refuses files that would read others or fill the memory; what can't be
-trusted even so is read by :func:`read_in_child`. New files are written under a temporary name and
+Libraries that read file formats raise exceptions of any type for a damaged file. Their calls are
+made in a ``with reading(...)`` block, which turns all of these into InputError. HDF5 is opened by
+:func:`open_hdf5`, which refuses files that would read others or fill the memory. Formats whose
+parsers may crash: :func:`read_in_child`. New files are written under a temporary name and
 then renamed: :func:`atomic`.
 """
 
@@ -34,17 +34,17 @@ from modeharvest.util.errors import InputError, WriteError
 from modeharvest.util.machine import require_memory
 
 _CHILD_SECONDS, _CHILD_SECONDS_PER_BYTE = 60.0, 1e-5
-"""After which a file is taken for one that makes its parser run for ever."""
+"""Time limit of a parser [s], and what it is extended by per byte of the file."""
 _LARGEST_SEARCHED = 1e8  # bytes
 
 
 @contextmanager
 def reading(path: Path | str, what: str, remedy: str = "make it again") -> Iterator[Path]:
-    """Turn whatever ends the block into InputError; nothing but reading the file belongs in it.
+    """Turn any exception in the block into InputError; the block must only read the file.
 
-    ``what`` is expected at ``path``: "a solution (HDF5)"; ``remedy``: what to do. InputError also
-    if there is no such file or it is a folder. What the block itself says is kept, behind the
-    file's name.
+    ``what``: the expected content of ``path``, such as "a solution (HDF5)". ``remedy``: advice to
+    the user. InputError also if there is no such file or it is a folder. The message of an
+    InputError raised in the block is kept, after the file's name.
     """
     path = Path(path)
     require_file(path, what, remedy)
@@ -53,12 +53,12 @@ def reading(path: Path | str, what: str, remedy: str = "make it again") -> Itera
     except InputError as error:
         line = " ".join(str(error).split())
         raise InputError(line if str(path) in line else f"{path}: {line}") from error
-    except Exception as error:  # every format and library has exceptions of its own
+    except Exception as error:  # exceptions differ between formats and libraries
         raise InputError(f"expected {what} at {path}, got: {reason(error)}; {remedy}") from error
 
 
 def require_file(path: Path, what: str, remedy: str) -> None:
-    """Raise InputError unless there is a file."""
+    """Raise InputError unless ``path`` is an existing file."""
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
         raise InputError(f"expected {what} at {path}, found {found}; {remedy}")
@@ -69,7 +69,7 @@ def require_file(path: Path, what: str, remedy: str) -> None:
 
 
 def reason(error: BaseException) -> str:
-    """Why a library gave up, in one line."""
+    """The message of a library's exception, in one line."""
     if isinstance(error, KeyError) and len(error.args) == 1 and " " not in str(error.args[0]):
         return f"no {error.args[0]!r}"
     if isinstance(error, MemoryError):
@@ -82,12 +82,12 @@ def reason(error: BaseException) -> str:
 def open_hdf5(
     path: Path | str, what: str, remedy: str = "make it again", form: str | None = None
 ) -> Iterator[h5py.File]:
-    """An HDF5 file to read from; see :func:`reading` for what happens to errors.
+    """Open an HDF5 file for reading; errors are handled as by :func:`reading`.
 
-    ``form``: what its attribute ``format`` has to say; None for any. InputError also if the file is
-    of another format, reaches into other files (external storage, external links, virtual data), or
-    holds more than there is memory for: a file of a few hundred bytes can hand out any other one,
-    and declare any size.
+    ``form``: required value of its attribute ``format``; None for any. InputError also if the file
+    is of another format, refers to other files (external storage, external links, virtual data), or
+    declares more data than there is memory for. Otherwise a file of a few hundred bytes could
+    expose any other file, and declare any size.
     """
     with reading(path, what, remedy) as path:
         _require_sound_heaps(path)
@@ -99,10 +99,10 @@ def open_hdf5(
 
 
 def _require_sound_heaps(path: Path) -> None:
-    """Refuse a file in which libhdf5 1.14 would look for a text for ever.
+    """Refuse a file in which libhdf5 1.14 would search for a text without end.
 
-    It goes through a global heap by its objects' sizes, of which one is 0 in a damaged file. The
-    largest files aren't searched: runs leave them, and know their digests.
+    The library steps through a global heap by its objects' sizes; in a damaged file one may be 0.
+    Files above 100 MB aren't searched: they come from runs, which check their digests.
     """
     content = path.read_bytes() if path.stat().st_size < _LARGEST_SEARCHED else b""
     at = -1
@@ -118,9 +118,9 @@ def _require_sound_heaps(path: Path) -> None:
 
 
 def require_plausible(path: Path, declared: float) -> None:
-    """Refuse a file that declares more bytes than it can hold, or than there is memory for.
+    """Raise InputError if a file declares more bytes than it can hold or memory can take.
 
-    A header of a few bytes can declare any size; an InputError says so.
+    A header of a few bytes can declare any size.
     """
     size = path.stat().st_size
     if not declared <= child.BASE_BYTES / 10.0 + child.BYTES_PER_BYTE * size:
@@ -133,8 +133,8 @@ def require_plausible(path: Path, declared: float) -> None:
 def read_in_child(kind: str, path: Path | str, what: str, remedy: str) -> dict[str, NDArray[Any]]:
     """Numbers and texts of a file, by their names, read by :mod:`modeharvest.util.child`.
 
-    ``kind``: "mat" or "mesh"; the others as for :func:`reading`, and so are the errors where the
-    parser gives up, crashes, or doesn't end.
+    ``kind``: "mat" or "mesh"; other arguments as for :func:`reading`. Raises InputError as that
+    function does, also if the parser fails, crashes, or exceeds its time limit.
     """
     with reading(path, what, remedy) as path, tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "read.npz"
@@ -154,7 +154,7 @@ def read_in_child(kind: str, path: Path | str, what: str, remedy: str) -> dict[s
 def _require_self_contained(file: h5py.File, path: Path) -> None:
     total = 0.0
 
-    # What these return that isn't None ends the visit; what they raise would get lost in HDF5.
+    # Returning anything but None ends the visit; an exception would get lost in HDF5.
     def outside(name: str, link: Any) -> str | None:
         is_external = isinstance(link, h5py.ExternalLink)
         return f"{name!r}, which is in another file, {link.filename!r}" if is_external else None
@@ -176,16 +176,16 @@ def _require_self_contained(file: h5py.File, path: Path) -> None:
 
 
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.part(\.[^.]*)?")
-"""Names that :func:`atomic` gives, with the process in them."""
+"""Temporary names given by :func:`atomic`; they contain the process id."""
 
 
 @contextmanager
 def atomic(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` if the block succeeds.
 
-    Whatever ends the block early (an exception, a full disk, Ctrl-C) removes the temporary
-    file, so a reader never sees half a file; what a killed process left is removed by the next
-    that writes in the same folder. File and folder reach the disk before the block ends, so that a
+    If the block ends early (an exception, a full disk, Ctrl-C), the temporary file is removed, so
+    a reader never sees half a file. Files of a killed process are removed by the next process that
+    writes in the same folder. File and folder reach the disk before the block ends, so that a
     power cut leaves no empty file under a finished name. The suffix is kept, because libraries
     choose formats by it. Raises InputError if the operating system refuses the write (disk full, no
     permission).
@@ -203,12 +203,12 @@ def atomic(path: Path | str) -> Iterator[Path]:
     except OSError as error:
         raise WriteError(f"could not write {path}: {error.strerror or error}") from error
     finally:
-        with suppress(OSError):  # it may never have been there, nor its folder
+        with suppress(OSError):  # the file, or its folder, may not exist
             temporary.unlink(missing_ok=True)
 
 
 def _flush(path: Path, mode: int) -> None:
-    """Have the disk itself store a file or a folder's names."""
+    """Flush a file, or the entries of a folder, to the disk."""
     descriptor = os.open(path, mode)
     try:
         os.fsync(descriptor)
@@ -217,7 +217,7 @@ def _flush(path: Path, mode: int) -> None:
 
 
 def remove_orphans(folder: Path | str) -> None:
-    """Remove temporary files in a folder whose process is no more."""
+    """Remove the temporary files in a folder whose process has ended."""
     for name in os.listdir(folder):
         orphan = _TEMPORARY.fullmatch(name)
         if orphan and not psutil.pid_exists(int(orphan[1])):
@@ -225,9 +225,9 @@ def remove_orphans(folder: Path | str) -> None:
 
 
 def make_folder(folder: Path | str) -> None:
-    """Make a folder, and those above it, where they are not there yet.
+    """Make a folder and its parents, where they do not exist yet.
 
-    Raises InputError if there is a file in its place or above it, OSError if the operating system
+    Raises InputError if the path, or a parent of it, is a file; OSError if the operating system
     refuses it for another reason.
     """
     folder = Path(folder)
@@ -236,7 +236,7 @@ def make_folder(folder: Path | str) -> None:
 
 
 def require_no_file(folder: Path) -> None:
-    """Raise InputError if a folder can't be: if a file is in its place, or above it."""
+    """Raise InputError if the path of a folder, or one of its parents, is a file."""
     for place in (folder, *folder.parents):
         if os.path.isdir(place):
             return
@@ -257,19 +257,19 @@ def require_writable(folder: Path | str) -> None:
 def atomic_hdf5(path: Path | str) -> Iterator[h5py.File]:
     """Yield a new HDF5 file that appears at ``path`` when the block has succeeded.
 
-    It is made in memory first: on a full disk HDF5 can't close a file of its own and complains
-    about it until the program ends.
+    The file is made in memory first: on a full disk HDF5 can't close a file on it, and prints
+    errors until the program ends.
     """
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         yield file
     with atomic(path) as temporary:
-        # Not its buffer: memory that is lent to a failed write can't be freed.
+        # A copy, not the buffer: a buffer exported to a failed write can't be freed.
         temporary.write_bytes(memory.getvalue())
 
 
 def copy_whole(source: Path | str, path: Path | str) -> None:
-    """Copy a file, atomically."""
+    """Copy a file; ``path`` is complete or absent, see :func:`atomic`."""
     with atomic(path) as temporary:
         shutil.copyfile(source, temporary)
 
@@ -281,7 +281,7 @@ def write_json(path: Path | str, content: Any) -> None:
 
 
 def write_csv(path: Path | str, heads: Iterable[object], rows: Iterable[Iterable[object]]) -> None:
-    """Write a table, atomically; numbers with all their digits, nothing for None."""
+    """Write a CSV table, atomically; numbers in full precision, None as an empty field."""
     with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([heads, *rows])
 
@@ -295,8 +295,8 @@ def read_json(path: Path | str) -> Any:
 def read_record(path: Path | str, form: str, what: str, remedy: str) -> dict[str, Any]:
     """Read a JSON object whose ``format`` is ``form``.
 
-    ``what`` is expected there, and ``remedy`` what to do, for the InputError if it is missing,
-    damaged, or of another format.
+    ``what`` (the expected content) and ``remedy`` (advice) are for the message of the InputError
+    that is raised if the file is missing, damaged, or of another format.
     """
     with reading(path, what, remedy):
         content = read_json(path)

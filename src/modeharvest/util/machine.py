@@ -1,6 +1,6 @@
 """The machine that the program runs on: free memory, and the ranks that mpirun started.
 
-MPI is asked only where a launcher has left its marks, so that nothing else has to load it.
+MPI is loaded only if environment variables of a launcher are set: other processes don't need it.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from modeharvest.util.errors import InputError
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUP = Path("/proc/self/cgroup")
 _LITTLE = 1e6
-"""Bytes that need not be asked for: less than an import takes."""
+"""Amounts below this are not checked [bytes]: less than an import takes."""
 _UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def available_bytes() -> float:
     """Memory that this process may still take [bytes]: the machine's, or its container's."""
-    import psutil  # not before: it would be a tenth of what the command line takes to start
+    import psutil  # here: it is a tenth of the command line's start time
 
     return min(float(psutil.virtual_memory().available), *map(_left_in, _own_cgroups()))
 
 
 def require_memory(needed: float, what: str, remedy: str) -> None:
-    """Refuse work, by an InputError, before it allocates more than there is.
+    """Raise InputError before work that would allocate more memory than is available.
 
-    ``needed``: a rough estimate [bytes], infinite or NaN is too much; ``what`` needs it: "an image
-    of 9000 x 9000 px"; ``remedy``: what to change.
+    ``needed``: a rough estimate [bytes]; infinity and NaN are refused. ``what`` needs it, such as
+    "an image of 9000 x 9000 px"; ``remedy``: advice to the user.
     """
     if needed < _LITTLE:
         return
@@ -60,7 +60,7 @@ def _own_cgroups() -> list[Path]:
 
 
 def _left_in(folder: Path) -> float:
-    """What a control group may still take [bytes]; files it has cached don't count as taken."""
+    """Memory left to a control group [bytes]; its cached files count as free memory."""
     v2, v1 = ("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")
     for limit, usage in (v2, v1):
         with suppress(OSError, ValueError):
@@ -104,13 +104,13 @@ def is_alone() -> bool:
 
 
 def is_first() -> bool:
-    """Whether this is rank 0, the one that writes and talks."""
+    """Whether this is rank 0, which alone writes files and messages."""
     world = _world()
     return world is None or world.rank == 0
 
 
 def on_first(work: Callable[[], T]) -> T:
-    """Do work on rank 0 alone; every rank waits for it, and returns or raises what it did."""
+    """Do work on rank 0 only; all ranks wait, then return its result or raise its exception."""
     world = _world()
     if world is None:
         return work()
@@ -118,7 +118,7 @@ def on_first(work: Callable[[], T]) -> T:
     if world.rank == 0:
         try:
             done = work(), None
-        except Exception as error:  # of any kind: the others would wait for ever
+        except Exception as error:  # of any type: the other ranks would wait for ever
             done = None, error
     value, failure = world.bcast(done)
     if failure is not None:

@@ -1,4 +1,4 @@
-"""Masks as sets of pixels: grown, shrunk, opened; their connected parts, the room in them."""
+"""Morphology of masks: dilation, erosion, opening, connected parts, distance to the boundary."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from modeharvest.util.arrays import BoolArray, IntArray
 
 
 def grown(mask: BoolArray, px: float) -> BoolArray:
-    """The mask and all pixels within this distance of it [px]; none of an empty mask."""
+    """Dilation: all pixels within the distance ``px`` of the mask; an empty mask stays empty."""
     found, wide, half = mask.copy(), mask.copy(), 0
     for off in range(min(int(px), len(mask) - 1), -1, -1):  # rows of a disk, the outermost first
         while np.sqrt((half + 1) ** 2 + off**2) <= px:
@@ -22,9 +22,9 @@ def grown(mask: BoolArray, px: float) -> BoolArray:
 
 
 def shrunk(mask: BoolArray, px: float, *, at_border: bool = False) -> BoolArray:
-    """The mask without the pixels within this distance of the rest [px].
+    """Erosion: the mask without pixels within the distance ``px`` of pixels outside the mask.
 
-    ``at_border``: what lies beyond the image belongs to the rest.
+    ``at_border``: the area beyond the image counts as outside the mask.
     """
     if at_border:
         return shrunk(np.pad(mask, 1), px)[1:-1, 1:-1]
@@ -32,12 +32,12 @@ def shrunk(mask: BoolArray, px: float, *, at_border: bool = False) -> BoolArray:
 
 
 def opened(mask: BoolArray, radius: float, *, at_border: bool = False) -> BoolArray:
-    """What of a mask a disk of this radius [px] can cover without leaving it, as ``shrunk``."""
+    """Opening by a disk of this radius [px]; ``at_border`` as for :func:`shrunk`."""
     return grown(shrunk(mask, radius, at_border=at_border), radius)
 
 
 def large_parts(mask: BoolArray, least_px: float) -> BoolArray:
-    """A mask's connected parts of at least so many pixels."""
+    """The connected parts of a mask that have at least ``least_px`` pixels."""
     parts, _ = label(mask)
     keep = np.bincount(parts.ravel()) >= least_px
     keep[0] = False
@@ -51,6 +51,6 @@ def connected_to(seed: BoolArray, mask: BoolArray) -> BoolArray:
 
 
 def room_around(mask: BoolArray) -> IntArray:
-    """(rows, cols) chessboard distance to what is off the mask or beyond the image [px]."""
+    """(rows, cols) chessboard distance [px] to the nearest pixel outside mask or image."""
     distance = distance_transform_cdt(np.pad(mask, 1), "chessboard")
     return np.asarray(distance[1:-1, 1:-1], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Progress of long work, reported without knowing who listens."""
+"""Progress of long work, reported to a listener that the caller chooses."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ T = TypeVar("T")
 
 
 class Progress(Protocol):
-    """A listener for progress; the command line shows a bar with the time left."""
+    """A listener for progress; that of the command line shows a bar and the time left."""
 
     def __call__(self, done: float, total: float, what: str) -> None:
-        """Take note that ``done`` of ``total`` units of the step ``what`` are finished."""
+        """Report that ``done`` of ``total`` units of the step ``what`` are finished."""
 
 
 def silent(done: float, total: float, what: str) -> None:
@@ -29,7 +29,7 @@ def named(progress: Progress, name: str) -> Progress:
 
 
 def counted(items: Sequence[T], progress: Progress, what: str) -> Iterator[T]:
-    """The items one after the other, their progress reported as the step ``what``."""
+    """Iterate over the items and report the progress as the step ``what``."""
     for done, item in enumerate(items):
         progress(done, len(items), what)
         yield item

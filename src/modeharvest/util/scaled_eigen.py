@@ -1,4 +1,4 @@
-"""A normal matrix by its eigenvectors: steps along what the data determine, and no others."""
+"""Normal equations solved by eigenvectors, along the directions that the data determine only."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class ScaledEigen:
     """A positive semi-definite matrix, scaled to a unit diagonal and decomposed."""
 
     scale: FloatArray
-    """(n,): square root of the diagonal; infinite where that is nothing but rounding."""
+    """(n,) square root of the diagonal; infinite where that is at the level of rounding."""
     values: FloatArray
-    """Ascending."""
+    """(n,) eigenvalues of the scaled matrix, ascending."""
     vectors: FloatArray
-    """Of the scaled matrix, as are the eigenvalues."""
+    """(n, n) eigenvectors of the scaled matrix, as columns."""
 
     @classmethod
     def of(cls, matrix: FloatArray) -> ScaledEigen:
-        """Decompose a matrix."""
+        """Scale and decompose a positive semi-definite matrix (n, n)."""
         diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-        # Scaling rounding up to 1 would make a direction of it, with enormous steps along it.
+        # If rounding errors were scaled up to 1, steps along that direction would be enormous.
         observed = diagonal > _ROUNDING * diagonal.max(initial=0.0)
         scale = np.where(observed, diagonal, np.inf)
         values, vectors = np.linalg.eigh(matrix / scale / scale[:, None])
@@ -35,28 +35,28 @@ class ScaledEigen:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(n,) True for eigenvectors whose eigenvalue stands out of the rounding."""
+        """(n,) True for eigenvectors whose eigenvalue exceeds the level of rounding."""
         floor = 1e-13 * len(self.values) * max(float(self.values[-1]), 0.0)
         return np.asarray(self.values > floor)
 
     @property
     def condition_number(self) -> float:
-        """Largest over smallest eigenvalue of the *column-scaled* matrix; may be infinite."""
+        """Largest over smallest eigenvalue of the *scaled* matrix; infinite if it is singular."""
         if not self.determined.all():
             return float("inf")
         return float(self.values[-1] / self.values[0])
 
     def solve(self, right: FloatArray, damping: float = 0.0, cutoff: float = 0.0) -> FloatArray:
-        """Solve (matrix + damping diag) x = right on the determined directions.
+        """Solve (matrix + damping diag(matrix)) x = right along the determined directions.
 
-        Those with an eigenvalue below ``cutoff`` times the largest one count as undetermined, too.
+        Directions with an eigenvalue below ``cutoff`` times the largest are left out, too.
         """
         keep = self.determined & (self.values >= cutoff * self.values[-1])
         part = self.vectors[:, keep].T @ (right / self.scale) / (self.values[keep] + damping)
         return np.asarray(self.vectors[:, keep] @ part / self.scale)
 
     def inverse(self) -> FloatArray:
-        """Inverse of the matrix; infinite on the diagonal of unknowns not determined."""
+        """Inverse of the matrix; its diagonal is infinite for unknowns that are not determined."""
         keep = self.determined
         half = self.vectors[:, keep] / np.sqrt(self.values[keep]) / self.scale[:, None]
         result = half @ half.T

@@ -1,13 +1,13 @@
-"""Work in stages that a folder remembers, so that what is finished is not done again.
+"""Work in stages recorded in a folder, so that finished stages are not repeated.
 
 ::
 
-    stages.json     of each finished stage its key, the digest of all that its outcome depends
-                    on, and the size and the SHA-256 of every file that it left
-    timings.json    what the stages took [s]; the one file that differs from run to run
-    .lock           who works in the folder, while somebody does
+    stages.json     for each finished stage: its key (the digest of all that its outcome depends
+                    on), and the size and the SHA-256 of every file that it wrote
+    timings.json    durations of the stages [s]; the only file that differs from run to run
+    .lock           the process that works in the folder, as long as it does
 
-Part of every key is the digest of the package's own code: a version's number lags behind it.
+Every key includes a digest of the package's code, which may change without the version number.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ def versions(*libraries: str) -> dict[str, str]:
 
 @cache
 def source_digest(*folders: str) -> str:
-    """SHA-256 of the package's own code, hexadecimal: a version's number lags behind it.
+    """SHA-256 of the package's code, hexadecimal; it may change without the version number.
 
-    ``folders`` of the package that count, such as "fem" and "imaging", besides the modules at its
-    root and util, which always do; all of them if none is named. Since imports go one way, those up
-    to the one that does the work are all that it can depend on.
+    ``folders`` of the package to include, such as "fem" and "imaging"; all if none is named. The
+    modules at its root and in util are always included. Imports between folders go one way: work
+    done in a folder can depend only on that folder and those below it.
     """
     found = hashlib.sha256()
     root = resources.files("modeharvest")
@@ -72,7 +72,7 @@ def source_digest(*folders: str) -> str:
 def _sources(
     folder: Traversable, name: str, only: tuple[str, ...]
 ) -> Iterator[tuple[str, Traversable]]:
-    """Code and templates in a folder of the package and below; those of util count always."""
+    """Code and templates in a folder of the package and below; util is always included."""
     for entry in folder.iterdir():
         if entry.is_dir():
             if entry.name != "__pycache__" and (not only or entry.name in ("util", *only)):
@@ -96,7 +96,7 @@ class Stages:
         self.folder = folder
 
     def is_finished(self, name: str, key: str) -> bool:
-        """Whether a stage was finished with this key, and its files are what it wrote."""
+        """Whether a stage was finished with this key and its files are unchanged since."""
         stage = self._record().get(name)
         return stage is not None and stage.get("key") == key and all(
             _is_whole(self.folder / path, entry) for path, entry in stage["files"].items()
@@ -105,12 +105,12 @@ class Stages:
     def do(
         self, name: str, key: str, work: Callable[[], Iterable[Path]], *, collective: bool = False
     ) -> None:
-        """Do the work unless it was finished with the same key and its files are whole.
+        """Do the work unless it was finished with the same key and its files are unchanged.
 
-        ``key``: see :func:`stage_key`; ``work`` leaves files in the folder and returns their paths;
-        ``collective``: under mpirun all ranks work, otherwise rank 0 does, and the others wait.
-        Raises InputError if the disk refuses or another process works in the folder, and what the
-        work raises.
+        ``key``: see :func:`stage_key`. ``work`` writes files in the folder and returns their paths.
+        ``collective``: under mpirun all ranks work; otherwise rank 0 works and the others wait.
+        Raises InputError if files can't be written or another process works in the folder, and any
+        exception of the work.
         """
         if on_first(lambda: self.is_finished(name, key)):
             return
@@ -120,9 +120,9 @@ class Stages:
             on_first(lambda: self._remember(name, key, files))
 
     def require_whole(self, path: Path, advice: str) -> None:
-        """Raise InputError if a file is not what the stage that left it wrote.
+        """Raise InputError if a file has changed since its stage wrote it.
 
-        One that no stage left is believed.
+        A file that no stage wrote is accepted.
         """
         name = path.relative_to(self.folder).as_posix()
         for stage in self._record().values():
@@ -134,24 +134,24 @@ class Stages:
 
     @property
     def timings(self) -> dict[str, float]:
-        """What stages took [s]; empty if nobody knows."""
+        """Durations of the stages [s]; empty if there is no record."""
         return dict(_table(self.folder / TIMINGS))
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """Take down what the work of a stage takes [s]."""
+        """Record how long the work of a stage takes [s]."""
         begin = time.perf_counter()
         yield
         seconds = {name: time.perf_counter() - begin}
         on_first(lambda: write_json(self.folder / TIMINGS, self.timings | seconds))
 
     def _record(self) -> dict[str, dict[str, Any]]:
-        """The finished stages; what makes no sense, as in a damaged file, is left out."""
+        """The finished stages; invalid entries, as of a damaged file, are left out."""
         every = _table(self.folder / RECORD).items()
         return {n: s for n, s in every if isinstance(s, dict) and isinstance(s.get("files"), dict)}
 
     def _forget(self, name: str) -> None:
-        """Remove a stage's files, which are of other inputs; its record first."""
+        """Remove a stage's record, then its files, which belong to other inputs."""
         record = self._record()
         stage = record.pop(name, {"files": {}})
         write_json(self.folder / RECORD, record)
@@ -160,7 +160,7 @@ class Stages:
                 (self.folder / path).unlink(missing_ok=True)
 
     def _remember(self, name: str, key: str, files: Iterable[Path]) -> None:
-        """Take down that a stage is finished."""
+        """Record that a stage is finished."""
         entries = {
             path.relative_to(self.folder).as_posix():
             {"bytes": path.stat().st_size, "sha256": sha256_of(path)} for path in files
@@ -170,9 +170,9 @@ class Stages:
 
 
 class Kept(Mapping[str, R]):
-    """What stages have left, by their names: read when it is asked for, and not kept but the last.
+    """Results of stages, by their names: read when accessed; only the last one stays in memory.
 
-    So thousands of images need no more memory than two.
+    Thousands of images need no more memory than two.
     """
 
     def __init__(self) -> None:
@@ -180,7 +180,7 @@ class Kept(Mapping[str, R]):
         self._kept = lru_cache(1)(lambda name: self._read[name]())
 
     def add(self, name: str, read: Callable[[], R]) -> None:
-        """Take in one more, the last in their order, and how it is read."""
+        """Append a result; ``read`` is the function that reads it."""
         self._read[name] = read
 
     def __getitem__(self, name: str) -> R:
@@ -195,11 +195,11 @@ class Kept(Mapping[str, R]):
 
 @dataclass(frozen=True)
 class StagedRun(Stages, Generic[C]):
-    """What every kind of run has: a case, a folder, stages that are not done twice."""
+    """Base of all kinds of runs: a case, a folder, and stages that are not repeated."""
 
     case: C
     folder: Path
-    """Made if it does not exist."""
+    """The folder of the results; it is made if it does not exist."""
     progress: Progress = silent
 
     def do_in_turn(
@@ -210,12 +210,12 @@ class StagedRun(Stages, Generic[C]):
         work: Callable[[str, tuple[str, R] | None], tuple[Sequence[Path], dict[str, Any]]],
         read: Callable[[str, dict[str, Any]], R],
     ) -> tuple[Kept[R], dict[str, str]]:
-        """A stage for each of several images, from the last one in which something was found.
+        """One stage for each of several images, each starting from the last successful result.
 
-        ``keys``: by their names; ``work`` gets a name, and that of the last one with what was found
-        there, leaves files, and returns them with the content of ``NAME_start.json`` in the folder
-        ``records``; ``read`` reads them again. Returns what was found and why others failed: an
-        InputError of the work is taken down as ``failed``, unless its files couldn't be written.
+        ``keys``: stage keys by image name. ``work`` gets a name, and name and result of the last
+        success (or None); it writes files and returns them with the content of ``NAME_start.json``
+        in the folder ``records``. ``read`` reads a result. Returns results, and messages of
+        failures: an InputError is recorded as ``failed``, unless files couldn't be written.
         """
         found: Kept[R] = Kept()
         failed: dict[str, str] = {}
@@ -245,19 +245,19 @@ class StagedRun(Stages, Generic[C]):
 def stage_key(content: object, *folders: str) -> str:
     """The digest of all that a stage's outcome depends on.
 
-    ``content``, plain values: options, digests of files, keys of other stages; ``folders`` of the
-    package whose code counts, see :func:`source_digest`.
+    ``content``: plain values (options, digests of files, keys of other stages). ``folders`` of the
+    package whose code is included: see :func:`source_digest`.
     """
     return digest([source_digest(*folders), content])
 
 
 def digest(content: object) -> str:
-    """A short text that differs for different plain content."""
+    """A short hash of plain content."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _table(path: Path) -> dict[str, Any]:
-    """A JSON object of a file; empty if it is missing or damaged."""
+    """The JSON object in a file; empty if the file is missing or damaged."""
     try:
         content = read_json(path)
     except InputError:
@@ -266,7 +266,7 @@ def _table(path: Path) -> dict[str, Any]:
 
 
 def _is_whole(path: Path, entry: object) -> bool:
-    """Whether a file is what was written; its size, which costs nothing, is looked at first."""
+    """Whether a file is as recorded; compares its size first, then its SHA-256."""
     if not isinstance(entry, dict) or not path.is_file():
         return False
     return path.stat().st_size == entry.get("bytes") and sha256_of(path) == entry.get("sha256")
@@ -281,13 +281,13 @@ _of_this_thread = threading.local()
 
 @contextmanager
 def exclusive(folder: Path | str) -> Iterator[None]:
-    """Have a folder for this process alone; within, the same thread may ask for it again.
+    """Lock a folder for this process; the same thread may lock it again within the block.
 
-    The operating system gives the folder back when its holder ends, however it ends. Where the
-    file system has no locks (that of some networks, or Windows) the file ``.lock`` alone decides,
-    and is believed unless it is of a process that this machine had and has no more. Where nothing
-    can be written nothing is locked. Under mpirun rank 0 holds the folder for all. Raises
-    InputError if another process has it (which, where and since when), or the disk refuses.
+    The operating system releases the lock when its holder ends, however it ends. On file systems
+    without locks (some network drives, Windows) the file ``.lock`` alone decides; it is ignored
+    only if it names a process of this machine that has ended. Where nothing can be written nothing
+    is locked. Under mpirun rank 0 holds the lock for all. Raises InputError if another process
+    holds it (which, where and since when), or the file can't be written.
     """
     folder = Path(folder).resolve()
     mine: set[Path] = _of_this_thread.__dict__.setdefault("folders", set())
@@ -305,7 +305,7 @@ def exclusive(folder: Path | str) -> Iterator[None]:
 
 
 class _Lock:
-    """A file that is locked while somebody works beside it, and says who."""
+    """A file that is locked while a process works in its folder, and names that process."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -329,7 +329,7 @@ class _Lock:
             os.close(self._file)
         with suppress(OSError):  # it may have been removed by hand
             self._path.unlink()
-        if os.name == "posix":  # last: who opens the name from now on makes a new file
+        if os.name == "posix":  # last: opening this name now makes a new file
             os.close(self._file)
         self._file = None
 
@@ -345,13 +345,13 @@ class _Lock:
             if isinstance(error, FileNotFoundError):
                 return None
             raise
-        with suppress(OSError):  # a full disk: it is locked all the same
+        with suppress(OSError):  # a full disk: the lock holds nevertheless
             os.truncate(file, 0)
             os.write(file, json.dumps(_this_process()).encode())
         return file
 
     def _require_free(self, file: int) -> None:
-        """Lock the file; InputError if another process has."""
+        """Lock the file; InputError if another process has locked it."""
         holder = _table(self._path)
         try:
             if fcntl is None:
@@ -378,7 +378,7 @@ class _Lock:
 
 
 def _this_process() -> dict[str, Any]:
-    """Who holds a lock."""
+    """Description of this process, as the holder of a lock."""
     return {
         "process": os.getpid(),
         "host": socket.gethostname(),
@@ -388,6 +388,6 @@ def _this_process() -> dict[str, Any]:
 
 
 def _is_gone(holder: dict[str, Any]) -> bool:
-    """Whether a holder was a process of this machine that is no more."""
+    """Whether a holder was a process of this machine that has ended."""
     process, is_here = holder.get("process"), holder.get("host") == socket.gethostname()
     return is_here and isinstance(process, int) and not psutil.pid_exists(process)

@@ -1,8 +1,8 @@
-"""Plain values, as files hold them, from dataclasses and to the dataclasses they describe.
+"""Conversion between dataclasses and plain values, as stored in files.
 
-For the latter pydantic does the work; its first finding becomes one line. Numbers have to be
-finite, and a boolean or a text is no number, though pydantic would take ``true`` for 1 and ``"3"``
-for 3.
+Plain values are validated by pydantic, whose first error is reported in one line. Numbers must be
+finite. A boolean or a text is not accepted as a number, though pydantic would take ``true`` for 1
+and ``"3"`` for 3.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ CHECKS: ConfigDict = {
     "arbitrary_types_allowed": True,
     "allow_inf_nan": False,
 }
-"""No unknown keys, no infinite numbers; nested dataclasses have the same rules."""
+"""pydantic's options: unknown keys and infinite numbers are refused, nested ones too."""
 
 _LARGEST = 1e15
-"""Whatever its unit, no length, stress or count that is meant is larger; squares don't overflow."""
+"""Largest number accepted, in any unit: no real input is larger, and squares don't overflow."""
 T = TypeVar("T")
 
 
 def made(kind: type[T], values: object) -> T:
-    """The dataclass that plain values describe.
+    """Make a dataclass from plain values.
 
-    Raises InputError if a key is unknown (the nearest known one is suggested) or missing, or a
-    value is of another type or out of its range; the place is named as ``table.key``.
+    Raises InputError if a key is unknown (the nearest known key is suggested) or missing, or a
+    value is of another type or out of range; the message names the place as ``table.key``.
     """
-    from pydantic import TypeAdapter, ValidationError  # here: a fifth of a second
+    from pydantic import TypeAdapter, ValidationError  # here: the import takes 0.2 s
 
     try:
         (thing,) = TypeAdapter(tuple[kind], config=CHECKS).validate_python((values,))  # type: ignore[valid-type]
@@ -49,10 +49,10 @@ def made(kind: type[T], values: object) -> T:
 
 
 def require_types(given: object, found: object, where: str = "") -> None:
-    """Compare values with what was made of them, leaf by leaf.
+    """Compare the values given with those that pydantic made of them, one by one.
 
-    Raises InputError if a boolean or a text became a number, a number a boolean, or a number is
-    beyond all use.
+    Raises InputError if a boolean or a text became a number, a number became a boolean, or a
+    number is larger than ``_LARGEST``.
     """
     if isinstance(given, Mapping):
         for key, value in given.items():
@@ -78,13 +78,13 @@ def _kind(value: object) -> str:
 def to_plain(value: Any) -> Any:
     """Plain JSON values: dataclasses and mappings as dictionaries, arrays and tuples as lists.
 
-    Null stands for what is no finite number.
+    Numbers that are not finite become null.
     """
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
         return {str(key): to_plain(nested) for key, nested in value.items()}
-    if hasattr(value, "tolist"):  # numpy's arrays and numbers
+    if hasattr(value, "tolist"):  # arrays and numbers of numpy
         return to_plain(value.tolist())
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [to_plain(nested) for nested in value]
@@ -92,12 +92,12 @@ def to_plain(value: Any) -> Any:
 
 
 def picked(thing: object, names: str) -> dict[str, Any]:
-    """Some attributes of an object by their names, which stand in one text."""
+    """Attributes of an object as a dictionary; ``names``: one text, separated by spaces."""
     return {name: getattr(thing, name) for name in names.split()}
 
 
 def quantity(label: str, unit: str = "", **options: Any) -> Any:
-    """A dataclass' field that readers call by a label, in a unit; ``options``: of a field."""
+    """A dataclass field with label and unit for readers; ``options``: those of ``field``."""
     return field(metadata={"label": label, "unit": unit}, **options)
 
 
@@ -109,7 +109,7 @@ def quantities(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def headings(*kinds: type[Any]) -> dict[str, str]:
-    """Of dataclasses' quantities by their names: labels with units, as a table's headings."""
+    """Headings of a table: by name, label and unit of each quantity of these dataclasses."""
     found: dict[str, str] = {}
     for label, unit, name in (quantity for kind in kinds for quantity in quantities(kind)):
         found.setdefault(name, f"{label} [{unit}]" if unit not in ("", "–") else label)
@@ -117,13 +117,13 @@ def headings(*kinds: type[Any]) -> dict[str, str]:
 
 
 def described(error: ValidationError, model: type[Any] | None, skipped: int = 0) -> str:
-    """The first fault, in one line: where, what came, what was expected.
+    """The first error, in one line: place, expected and given value.
 
-    ``skipped``: how many steps of the fault's place are not the user's.
+    ``skipped``: number of leading parts of pydantic's place that the user does not know.
     """
     errors = error.errors()
     first, place, expected = errors[0], errors[0]["loc"][skipped:], errors[0]["msg"]
-    if place and str(place[-1]).startswith("literal["):  # the first of alternatives
+    if place and str(place[-1]).startswith("literal["):  # one of several alternatives
         *at, _ = first["loc"]
         kinds = (str(e["loc"][len(at)]) for e in errors if [*e["loc"][: len(at)]] == at)
         place, expected = place[:-1], f"expected {' or '.join(dict.fromkeys(kinds))}"
@@ -142,7 +142,7 @@ def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[s
     """The keys that the table at this place of a case may have."""
     place = model
     for part in table:
-        if not isinstance(part, int):  # a place in a list of tables
+        if not isinstance(part, int):  # an index in a list of tables is skipped
             place = _table_type(place, part)
     if place is None:
         return []
@@ -150,12 +150,12 @@ def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[s
 
 
 def _table_type(place: type[Any] | None, name: str) -> type[Any] | None:
-    """The dataclass of a table within another; None if it has none of its own."""
+    """The dataclass of a table within another; None if it is not a dataclass."""
     hint = None if place is None else get_type_hints(place).get(name)
     return next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)  # type: ignore[return-value]
 
 
 def nearest(name: str, known: list[str]) -> str:
-    """A hint at what was probably meant, or at all there is."""
+    """Hint for an error message: the most similar known name, or else all known names."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else f"; known are: {', '.join(known)}"

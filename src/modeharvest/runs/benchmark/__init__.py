@@ -39,7 +39,7 @@ from modeharvest.validation.scoring.star import StarSet
 from modeharvest.validation.scoring.star_grades import StarGrade, StarGrading, ranked_grades
 
 REACH_CELLS = 0.25
-"""How far a point can stand for others: an eighth of the pattern's wave, two cells long [-]."""
+"""Reach of a field's point [cells]: an eighth of the pattern's wavelength of two cells."""
 
 T = TypeVar("T")
 
@@ -51,13 +51,13 @@ def grade_star(
     out: Path | str,
     progress: Progress = silent,
 ) -> StarGrading:
-    """Grade fields measured on a star set; leaves a report, JSON and CSV in ``out``.
+    """Grade fields measured on a star set; writes a report, JSON and CSV to ``out``.
 
-    ``fields``: files of the deformed image, with what they don't say themselves; ``stills``: files
-    of the image without motion, one for each field in the same order, or none; ``folder``: the star
+    ``fields``: files for the deformed image, with what the files don't declare; ``stills``: files
+    for the image without motion, one per field in the same order, or none; ``folder``: the star
     set. Fields that can't be read, are of another set, in millimetres or don't contain the wave are
     in the result's ``refused``, each with the reason. Raises InputError if no field can be graded,
-    or two have one name.
+    or two have the same name.
     """
     if stills and len(stills) != len(fields):
         raise InputError(
@@ -96,10 +96,10 @@ def make_benchmark(
     solution: Path | str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Simulate a case, image it, and part the images from their truth; resumed as every run.
+    """Simulate a case, make images, and separate them from their truth; can be resumed.
 
-    ``case``: a shipped case's name, the path of a TOML file, or a Case; ``public``: folder for what
-    anybody may have; ``truth``: for the truth, by default beside it, with "-truth" after its name;
+    ``case``: a shipped case's name, the path of a TOML file, or a Case; ``public``: folder of what
+    is published; ``truth``: folder of the truth, by default that name with "-truth" appended;
     ``solution``: use this (HDF5) instead of simulating. Returns the content of the public
     ``benchmark.json``. Raises InputError if the case's images are distorted, the truth would be in
     the public folder, the solution is of another case, or another process works in a folder.
@@ -118,7 +118,7 @@ def make_benchmark(
 
 
 def truth_folder(public: Path) -> Path:
-    """Where the truth of a public folder is by default."""
+    """The default folder of the truth of a public folder."""
     named = public if public.name not in ("", "..") else public.resolve()
     return named.with_name(f"{named.name}-truth")
 
@@ -133,14 +133,14 @@ def score(
 ) -> Grading:
     """Grade displacement fields and write ``report.html``, ``scores.json`` and ``scores.csv``.
 
-    Fields that can't be read, are of another benchmark or in another unit than declared are among
-    the ``refused``, each with the reason. InputError if none can be graded, or two have one name.
+    Fields that can't be read, are of another benchmark or in another unit than declared are in
+    ``refused``, each with the reason. InputError if none can be graded, or two have the same name.
 
-    fields : their files, with what the files don't say themselves.
-    truth, out : the truth's folder, and that for the report.
+    fields : files of the fields, with what the files don't declare.
+    truth, out : folder of the truth, and folder for the report.
     strain : nominal strain of the image that they were measured on [-].
     edge_px : material closer than this to a hole or to the outside counts as edge [px].
-    progress : listener.
+    progress : receives the progress.
     """
     from modeharvest.report.grades import write_grading
 
@@ -173,9 +173,9 @@ def _graded(
     progress: Progress,
     what: str,
 ) -> tuple[list[T], dict[str, str]]:
-    """The grades of the fields that have one, and why others have none.
+    """The grades of the fields, and the reasons for the fields that can't be graded.
 
-    Raises InputError if there is no field, two have one name, or none can be graded.
+    Raises InputError if there is no field, two have the same name, or none can be graded.
     """
     if not fields:
         raise InputError("expected fields to score, got none")
@@ -207,11 +207,11 @@ def declarations(
     first_pixels: Sequence[int] | None = None,
     columns: Sequence[str] | None = None,
 ) -> dict[Path, Declared]:
-    """What a command line declares of each file.
+    """The conventions that a command line declares for each file.
 
-    ``units``, ``y_axes`` and ``first_pixels``: one for all, or one for each; "file" where the
-    columns' names say it. ``columns``: "u=NAME" or "u=7", for all files. Raises InputError if there
-    are neither one nor as many as files, or not one of ``names`` for each.
+    ``units``, ``y_axes`` and ``first_pixels``: one for all files, or one for each; "file" if the
+    names of the columns state it. ``columns``: "u=NAME" or "u=7", for all files. InputError if the
+    number of these is neither one nor that of the files, or ``names`` aren't one for each.
     """
     if len(set(paths)) < len(paths):
         raise InputError(f"expected different files to score, got {', '.join(map(str, paths))}")
@@ -236,7 +236,7 @@ def declarations(
 
 
 def _each(given: Sequence[T] | None, paths: Sequence[Path], option: str) -> Sequence[T | None]:
-    """One value for each file."""
+    """One value for each file, from none, one, or as many values as files."""
     if not given:
         return [None] * len(paths)
     if len(given) == 1:

@@ -1,7 +1,7 @@
-"""Folders to share as RO-Crates: what every file is, its checksum, licence, software and command.
+"""Folders shared as RO-Crates: what every file is, its checksum, licence, software and command.
 
 An RO-Crate (https://w3id.org/ro/crate/1.1) is a folder with ``ro-crate-metadata.json``, JSON-LD in
-schema.org's words, which archives such as Zenodo and search engines read.
+schema.org's vocabulary, which archives such as Zenodo and search engines read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LICENCES = {
 }
 _TEMPORARY = (".*", "*.part", "*.log", "__pycache__")
 _KINDS = {".tif": "image/tiff", ".h5": "application/x-hdf5", ".vtu": "application/xml"}
-"""Of files whose kind Python doesn't know."""
+"""Media types of files that Python's ``mimetypes`` doesn't know, by extension."""
 _UNITS = {"mm": "mm", "px": "px", "percent": "%", "N": "N", "MPa": "MPa", "deg": "degree"}
 
 
@@ -40,13 +40,13 @@ def write_crate(
 ) -> dict[str, Any]:
     """Describe a finished folder in ``ro-crate-metadata.json``; returns its content.
 
-    folder : of a benchmark set, a harvest, a study or any other run: with ``benchmark.json`` or
-        ``summary.json``. Hidden files and logs are left out.
-    licence : one of :data:`LICENCES`, or an address; a set's own counts.
-    author : who made it, "Name" or "Name <https://orcid.org/...>".
-    name : title; the folder's own by default.
+    folder : folder of a benchmark set, a harvest, a study or any other run, which has
+        ``benchmark.json`` or ``summary.json``. Hidden files and logs are left out.
+    licence : one of :data:`LICENCES`, or a URL; the licence of a set takes precedence.
+    author : the author, "Name" or "Name <https://orcid.org/...>".
+    name : title; by default that which the folder states.
 
-    Raises InputError if the folder is none of these, or a public set holds what tells its truth.
+    Raises InputError if the folder is none of these, or a public set contains files of its truth.
     """
     folder = Path(folder)
     info = _described(folder)
@@ -98,7 +98,7 @@ def write_crate(
 
 
 def verify(folder: Path | str) -> list[str]:
-    """Faults of a crate, in sentences: files missing, changed, not listed; a set's id.
+    """Faults of a crate, as text: files missing, changed or not listed; a wrong id of a set.
 
     Raises InputError if the folder has no ``ro-crate-metadata.json`` that can be read.
     """
@@ -127,7 +127,7 @@ def verify(folder: Path | str) -> list[str]:
 
 
 def _fault(folder: Path, name: str, entry: Mapping[str, Any]) -> str:
-    """What is wrong with a listed file, or nothing."""
+    """Text on the fault of a listed file, "" if there is none."""
     path = folder / name
     if folder.resolve() not in path.resolve().parents:
         return f"{name}: lies outside the folder"
@@ -137,7 +137,7 @@ def _fault(folder: Path, name: str, entry: Mapping[str, Any]) -> str:
 
 
 def _described(folder: Path) -> dict[str, Any]:
-    """What a folder says of itself; InputError if it is no finished run, or tells a truth."""
+    """The data that describe a folder; InputError if unfinished, or public with a truth."""
     if (folder / BENCHMARK).is_file():
         info = dict(read_json(folder / BENCHMARK))
         secrets = [p.name for pattern in SECRETS for p in sorted(folder.glob(pattern))]
@@ -184,7 +184,7 @@ def _software(name: str, version: object) -> dict[str, Any]:
 
 
 def _quantities(info: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Numbers whose names end in their unit."""
+    """Entries for numbers whose names end in their unit."""
     for key, value in info.items():
         unit = _UNITS.get(key.rpartition("_")[2])
         if unit and isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -192,7 +192,7 @@ def _quantities(info: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _description(info: Mapping[str, Any]) -> str:
-    """One paragraph; lengths in images are in px, others in mm, x to the right and y up."""
+    """Description in one paragraph: content, where units are stated, and axes."""
     what = "Speckle images for any DIC code; the true displacements are kept apart."
     if "files" not in info:
         what = str(info.get("question") or "Results of modeharvest, with a report to read.")
@@ -200,6 +200,6 @@ def _description(info: Mapping[str, Any]) -> str:
 
 
 def _now() -> str:
-    """The date, or that of SOURCE_DATE_EPOCH."""
+    """The current date, or that of SOURCE_DATE_EPOCH if set."""
     seconds = int(os.environ.get("SOURCE_DATE_EPOCH") or time.time())
     return datetime.fromtimestamp(seconds, UTC).date().isoformat()

@@ -1,10 +1,10 @@
-"""The standard set of twelve cases, and a leaderboard of what codes hand in for it.
+"""The standard set of twelve cases, and a leaderboard of the fields that codes submit for it.
 
 ::
 
     DIR/         CASE/ summary.json ro-crate-metadata.json     benchmark standard
     DIR-truth/   CASE/ standard.json
-    CODES/       CODE/CASE.csv                                 handed in, of any kind of file
+    CODES/       CODE/CASE.csv                                 submitted fields, any file type
     OUT/         CASE/report.html leaderboard.json report.html benchmark leaderboard
 """
 
@@ -36,7 +36,7 @@ FORMAT, TRUTH = "modeharvest-standard-1", "standard.json"
 
 
 def standard_cases(seed: int = 0) -> dict[str, Case]:
-    """The twelve cases of ``standard.toml``; another seed has other strains, speckles, noise."""
+    """The twelve cases of ``standard.toml``; ``seed`` varies strains, speckles and noise."""
     base, cases = Case.read("paper-virtual"), {}
     factor = random.Random(seed).uniform(0.95, 1.05) if seed else 1.0
     text = resources.files(__package__).joinpath("standard.toml").read_text("utf-8")
@@ -58,10 +58,10 @@ def standard_cases(seed: int = 0) -> dict[str, Case]:
 def make_standard(
     public: Path | str, truth: Path | str | None = None, seed: int = 0, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Make the standard set: a public folder that is an RO-Crate, and apart from it the truth.
+    """Make the standard set: a public folder that is an RO-Crate, and separately the truth.
 
-    Resumed as every run. ``seed``: 0 is the open set, which anybody can make again with its truth;
-    another one's is known to who made it. Returns the content of ``summary.json``.
+    Can be resumed. ``seed``: 0 is the open set, which anybody can reproduce with its truth; the
+    truth for another seed is known only to its maker. Returns the content of ``summary.json``.
     """
     public = Path(public)
     truth = truth_folder(public) if truth is None else Path(truth)
@@ -96,10 +96,10 @@ def make_standard(
 def leaderboard(
     handed_in: Path | str, truth: Path | str, out: Path | str, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Grade a folder of submissions, ``CODE/CASE.*``; leaves a page for each case and one for all.
+    """Grade a folder of submissions, ``CODE/CASE.*``; writes a page for each case and one for all.
 
-    A code's number is the geometric mean of its rms errors [px] over the cases of which it covers
-    at least half of the material; codes with more of such cases come first. Returns the content of
+    A code's score is the geometric mean of its rms errors [px] over the cases in which it covers
+    at least half of the material; codes with more such cases rank first. Returns the content of
     ``leaderboard.json``. InputError if nothing can be graded.
     """
     from modeharvest.report.model import Card, Report, ReportTable, Section, write_page
@@ -157,7 +157,7 @@ def leaderboard(
 
 
 def _overall(cases: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """How many cases count, and the geometric mean of their errors."""
+    """The number of cases that count, and the geometric mean of their errors [px]."""
     errors = [max(c["rms_px"], 1e-9) for c in cases.values() if c["covered"] >= ENOUGH_COVERED]
     rms = float(np.exp(np.mean(np.log(errors)))) if errors else float("inf")
     return {"counted": len(errors), "rms_px": rms}

@@ -1,11 +1,11 @@
-"""A homogenized specimen as a case: a virtual experiment's, with two tables more.
+"""Case of a homogenized specimen: that of a virtual experiment, with two or three more tables.
 
 ::
 
-    [homogenization]               # the RVE, the macroscopic elements, what holds the pattern
+    [homogenization]               # the RVE, the macroscopic elements, conditions on v_i
     [mode]
-    kind = "measured"              # in the images of the experiment; or "analytic", "bloch", "file"
-    [loading]                      # optional: another one than the experiment's
+    kind = "measured"              # in the experiment's images; or "analytic", "bloch", "file"
+    [loading]                      # optional: replaces the experiment's loading
     [experiment]                   # and [imaging], [correlation], as of a virtual experiment
 """
 
@@ -30,56 +30,56 @@ from modeharvest.util.typed import picked, to_plain
 
 @dataclass(frozen=True, kw_only=True)
 class _Numbered:
-    """Modes that a specimen's stacking has: one if square, three if triangular."""
+    """Selection of modes; square stacking has one mode, triangular stacking three."""
 
     numbers: tuple[int, ...] = ()
-    """Which of them to use, from 1; by default all."""
+    """Numbers of the modes to use, from 1; by default all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Snapped(_Numbered):
-    """Modes whose wave vectors become the lattice's."""
+    """Modes whose wave vectors are replaced by those of the lattice ("snapped")."""
 
     snap_anyway: bool = False
-    """Even those that are off by more than error bars allow, which are refused otherwise."""
+    """Accept wave vectors that deviate by more than error bars allow; else they are refused."""
 
 
 @dataclass(frozen=True)
 class MeasuredMode(_Snapped):
-    """The modes that the experiment's own images show."""
+    """The modes measured in the images of the experiment."""
 
     strain: float | None = None
-    """Of the image [-]; by default the last one."""
+    """Nominal strain of the image used [-]; by default the last one."""
 
 
 @dataclass(frozen=True)
 class AnalyticMode(_Numbered):
-    """The paper's Eq. (mode), exactly; in triangular stacking the start of a correlation."""
+    """The paper's Eq. (mode), exactly; in triangular stacking a correlation's initial guess."""
 
 
 @dataclass(frozen=True)
 class BlochMode(_Numbered):
-    """The infinite lattice's, at its critical point under the same kind of load."""
+    """The modes of the infinite lattice at its critical point under the same kind of load."""
 
 
 @dataclass(frozen=True)
 class FileMode(_Snapped):
-    """Modes found elsewhere: measured, or computed on any cell by ``modeharvest modes``."""
+    """Modes from a file: measured, or computed on any cell by ``modeharvest modes``."""
 
     path: str
-    """The result of a correlation or of a harvest as JSON, of a specimen whose middle is the
-    origin; modes as HDF5, whose cell is the RVE; or, as "family_mode_*.json", families of modes of
-    a cell with a hole at its origin. In a case file, relative to its folder."""
+    """Result of a correlation or of a harvest (JSON), with the origin at the specimen's centre; or
+    modes (HDF5), whose cell becomes the RVE; or mode families ("family_mode_*.json") of a cell
+    with a hole at its origin. In a case file, relative to its folder."""
 
     @property
     def files(self) -> list[Path]:
-        """Those that the name stands for, in order; itself if there are none."""
+        """The files that match ``path``, sorted; ``path`` itself if there are none."""
         named = Path(self.path)
         return (sorted(named.parent.glob(named.name)) if named.name else []) or [named]
 
     @property
     def is_computed(self) -> bool:
-        """Whether the file has modes at the nodes of a cell."""
+        """Whether the file contains modes given at the nodes of a cell (HDF5)."""
         return Path(self.path).suffix == ".h5"
 
 
@@ -91,35 +91,35 @@ Mode = MeasuredMode | AnalyticMode | BlochMode | FileMode
 
 @dataclass(frozen=True)
 class HomogenizationOptions:
-    """Choices of homogenization that matter; docs/explanation/homogenization.md says how much."""
+    """Options of homogenization; for their influence see docs/explanation/homogenization.md."""
 
     centre: Literal["junction", "hole"] | tuple[float, float] | None = None
-    """About which the RVE of 2 x 2 cells is cut, or a point of it [mm]; by default a junction in
-    square stacking, in triangular one a hole, about which its three modes are alike."""
+    """Centre of the RVE of 2 x 2 cells: a junction, a hole, or a point [mm]. By default a junction
+    in square stacking; in triangular stacking a hole, about which its three modes are alike."""
     positions: int = 1
-    """RVEs at each point, whose mean counts: about there, and evenly spread over a cell."""
+    """RVEs at each point (1 to 100), averaged: about ``centre``, and evenly spread over a cell."""
     mesh_size: float = 0.2
     """Edge length of the RVE's elements [mm]."""
     pattern_at_plates: Literal["zero", "free"] = "zero"
     pattern_at_bulk: Literal["zero", "free"] = "zero"
-    """The amplitudes v_i where the lattice meets solid strips along loaded and free edges."""
+    """Conditions on v_i where the lattice meets solid strips along loaded and free edges."""
     quarter: bool | None = None
-    """Whether only the quarter of the specimen is followed that its mirror images make whole: a
-    homogenized specimen may bow where the real one does not (docs/explanation/homogenization.md).
-    By default where that can be: in square stacking and compression between free sides."""
+    """Whether only a quarter of the specimen is simulated and mirrored: a whole homogenized
+    specimen may bow where the real one does not (docs/explanation/homogenization.md). By default
+    where this is possible: in square stacking, compressed between free sides."""
     divisions: tuple[int, int] | None = None
-    """Macroscopic elements of the lattice along x and y; by default as the cells ask for."""
+    """Macroscopic elements of the lattice along x and y; by default according to its cells."""
     mesh: str | None = None
-    """A macroscopic mesh of one's own [mm] instead of the specimen, as ``read_body_mesh`` takes it;
-    in a case file, relative to that file's folder."""
+    """File of a macroscopic mesh [mm] that replaces the specimen, read by ``read_body_mesh``; in a
+    case file, relative to that file's folder."""
     edge_shifts: Literal["find"] | tuple[float, float] = "find"
-    """By how much a specimen's lattice is longer at each plate and higher at each side, which makes
-    up for its edges' energy [mm]; by default as ``micromorphic.edges`` finds them, of a mesh of
-    one's own none."""
+    """Extension of a specimen's lattice at each plate, and at each side [mm], which compensates for
+    the energy of its edges. By default computed by ``micromorphic.edges``; with a mesh from a file
+    none."""
     first_order: bool = True
-    """Whether to find the critical strain without modes, too."""
+    """Whether to compute also the critical strain of homogenization without modes."""
     error_bars: bool = True
-    """Whether to propagate a measured mode's error bars, which takes a run for each parameter."""
+    """Whether to propagate a measured mode's error bars; needs one run per parameter."""
 
     def __post_init__(self) -> None:
         what = "homogenization: expected"
@@ -131,14 +131,14 @@ class HomogenizationOptions:
 
 @dataclass(frozen=True)
 class SpecimenLoading(PlateMotion):
-    """What a homogenized specimen is put under where that isn't the experiment's compression."""
+    """Loading of a homogenized specimen other than the experiment's compression."""
 
     loads: tuple[float, ...] = ()
-    """e of the states to keep, ascending [-]; by default the experiment's strains."""
+    """Loads e of the states to keep [-], ascending; by default the experiment's strains."""
 
 
 class HomogenizationCase(CaseModel):
-    """A virtual experiment, and how its specimen is homogenized."""
+    """A virtual experiment, with the options by which its specimen is homogenized."""
 
     table = "homogenization"
 
@@ -153,7 +153,7 @@ class HomogenizationCase(CaseModel):
 
     @property
     def virtual(self) -> Case:
-        """The virtual experiment by itself."""
+        """The case of the virtual experiment, without homogenization."""
         return Case(
             title=self.title, experiment=self.experiment, imaging=self.imaging,
             correlation=self.correlation,
@@ -161,7 +161,7 @@ class HomogenizationCase(CaseModel):
 
     @classmethod
     def read(cls, name: str | Path) -> Self:
-        """Read a case as every other; a mode's file is found beside the case's."""
+        """Read a case as for any kind; paths of mode and mesh are relative to its folder."""
         case, folder, beside = super().read(name), Path(name).parent, dict[str, Any]()
         if isinstance(case.mode, FileMode):
             beside["mode"] = replace(case.mode, path=str(folder / case.mode.path))
@@ -171,24 +171,24 @@ class HomogenizationCase(CaseModel):
 
     @property
     def is_experiment(self) -> bool:
-        """Whether the direct simulation is of the same specimen under the same load."""
+        """Whether specimen and load are those of the experiment's direct simulation."""
         return self.loading is None and self.homogenization.mesh is None
 
     @property
     def quarter(self) -> bool:
-        """Whether a quarter is followed."""
+        """Whether only a quarter of the specimen is simulated; resolves the default."""
         can = self.experiment.specimen.stacking == "square" and self.is_experiment
         return can if self.homogenization.quarter is None else self.homogenization.quarter
 
     @property
     def centre(self) -> str | tuple[float, float]:
-        """About which the RVE is cut."""
+        """Centre of the RVE: its kind, or a point [mm]; resolves the default."""
         is_square = self.experiment.specimen.stacking == "square"
         return self.homogenization.centre or ("junction" if is_square else "hole")
 
     @property
     def loads(self) -> tuple[float, ...]:
-        """Of the states to keep [-]."""
+        """Loads of the states to keep [-]; resolves the default."""
         return (self.loading and self.loading.loads) or self.experiment.strains
 
     @property
@@ -200,7 +200,7 @@ class HomogenizationCase(CaseModel):
         return PlateLoading(**rates, **how, quarter=self.quarter)
 
     def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values, with what choices come to."""
+        """The case as plain JSON values, with defaults of options resolved."""
         chosen = {"centre": self.centre, "quarter": self.quarter}
         own = {"title": self.title, "homogenization": to_plain(self.homogenization) | chosen,
                "loading": to_plain(self.loading)}  # fmt: skip

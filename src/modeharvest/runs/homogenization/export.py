@@ -1,6 +1,6 @@
-"""An RVE for other codes: its mesh, modes, moduli as HDF5, and in the layout of a MATLAB FE2 code.
+"""Export of an RVE to other codes: mesh, modes, moduli as HDF5, and for a MATLAB FE2 code.
 
-``examples/read_rve.py`` reads the HDF5 with h5py alone; docs/reference/rve.md has its layout.
+``examples/read_rve.py`` reads the HDF5 file with h5py only; its layout: docs/reference/rve.md.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.micromorphic.rve import RVE, RVEState
 
 FORMAT = "modeharvest-rve-1"
-THICKNESS = 1.0  # mm: forces and energies of the program are those by thickness
+THICKNESS = 1.0  # mm: the program's forces and energies are per unit thickness
 _PER_STRAIN, _STRESS = "of the strain", "MPa by the unit of the strain"
 QUANTITIES = {
     "nodes": ("mm", "undeformed, from the RVE's centre"),
@@ -62,7 +62,7 @@ QUANTITIES = {
     "points": ("mm", "where in the specimen"),
     "buckled": ("-", "1: on the buckled branch, 0: on the primary path"),
 }
-"""Of each dataset its unit and what it is, which are its attributes, too."""
+"""Unit and description of each dataset, which are also written as its attributes."""
 
 
 def write_rve(
@@ -72,10 +72,10 @@ def write_rve(
 ) -> None:  # fmt: skip
     """Write an RVE with its modes, and its stresses and moduli at some states, as HDF5.
 
-    measured : how the modes, all of them, were measured.
-    position : which one it is, from 1, of how many that stand at each point, whose mean counts.
-    of_states : "loads" (k,), "points" (k, 2), "buckled" (k,) of the states, where they are a
-        specimen's.
+    measured : parameters and covariances of all modes, if they were measured.
+    position : number of this RVE, from 1, and the number of RVEs averaged at each point.
+    of_states : "loads" (k,), "points" (k, 2) [mm], "buckled" (k,) of the states, if they are
+        those of a specimen.
     """
     mesh, periodicity, m = rve.cell.cell.mesh, rve.cell.cell.periodicity, rve.mode_count
     pairs = periodic_pairs(periodicity)
@@ -107,14 +107,14 @@ def write_rve(
 
 
 def _named(count: int, gradient: str, each: str, slope: str) -> list[str]:
-    """Texts of all generalised strains: those of F̄, of every mode, of every mode's gradient."""
+    """Names of all generalised strains: of F̄, of each mode, of each mode's gradient."""
     numbers = range(1, count + 1)
     parts = [gradient, *(each.format(k) for k in numbers), *(slope.format(k, k) for k in numbers)]
     return " ".join(parts).split()
 
 
 def _put(group: h5py.Group, **values: ArrayLike | None) -> None:
-    """Values that are known, each with its unit and what it is."""
+    """Write values that are not None, each with its unit and description as attributes."""
     for name, value in values.items():
         if value is not None:
             kept = COMPRESSED if np.ndim(value) > 1 else {}
@@ -123,7 +123,7 @@ def _put(group: h5py.Group, **values: ArrayLike | None) -> None:
 
 
 def _put_measured(file: h5py.File, measured: MeasuredModes, rve: RVE) -> None:
-    """Parameters with covariances, and of each mode the waves before snapping and error bars."""
+    """Write parameters and covariances, and each mode's error bars and waves before snapping."""
     known = measured.parameters
     group, covariances = file.create_group("measured"), ("by_noise", "by_model_error")
     _put(group, parameters=known.values, **{name: getattr(known, name) for name in covariances})
@@ -136,7 +136,7 @@ def _put_measured(file: h5py.File, measured: MeasuredModes, rve: RVE) -> None:
 
 
 def periodic_pairs(periodicity: Periodicity) -> IntArray:
-    """(p, 2) image and source of all nodes that copy another one; no source is an image."""
+    """(p, 2) image and source of all periodic node pairs; no source is an image."""
     _, first = np.unique(periodicity.master, return_index=True)
     sources = first[periodicity.master]
     images = np.flatnonzero(sources != np.arange(len(sources)))
@@ -144,7 +144,7 @@ def periodic_pairs(periodicity: Periodicity) -> IntArray:
 
 
 def write_fe2(path: Path | str, rve: RVE) -> None:
-    """Write an RVE as a MATLAB file of ``RVEmesh`` and, if that code has the law, materials.
+    """Write an RVE as a MATLAB file: ``RVEmesh``, and materials if the FE2 code has their law.
 
     The layout is that of the code of Doskar, Rokos and others, github.com/FHendriks11/
     mechmetamat_homogenization: node numbers from 1, six-node triangles in the order of this
@@ -174,6 +174,6 @@ def write_fe2(path: Path | str, rve: RVE) -> None:
     memory = io.BytesIO()
     savemat(memory, content, do_compression=True)
     with atomic(path) as temporary:
-        # The header's text, of 116 bytes, would be the date.
+        # By default the header's text, 116 bytes, contains the date.
         head = b"MATLAB 5.0 MAT-file, RVE in mm and MPa".ljust(116)
         temporary.write_bytes(head + memory.getvalue()[116:])

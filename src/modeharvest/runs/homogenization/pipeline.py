@@ -1,14 +1,14 @@
-"""A specimen homogenized with its lattice's modes, in stages that can be resumed.
+"""Homogenization of a specimen with the modes of its lattice, in stages that can be resumed.
 
 ::
 
     experiment/                    the virtual experiment: direct simulation, images, measured mode
-    mode.json                      mode         as it was found, snapped to the lattice, error bars
+    mode.json                      mode         as measured, snapped to the lattice, error bars
     homogenized.json               homogenize   critical strain, forces, energies, sensitivities
     homogenized.h5                              the same states as fields
     rve.h5 rve.mat                              the RVE with modes and moduli, for other codes;
-                                                of several positions rve2, rve3, ... too
-    report.html summary.json       report       beside the direct simulation
+                                                with several positions rve2, rve3, ... too
+    report.html summary.json       report       compared with the direct simulation
 """
 
 from __future__ import annotations
@@ -77,21 +77,21 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.micromorphic.rve import RVEState
 
 _FAR = 3.44
-"""Standard deviations by which snapping may change a wave vector: two components are farther off by
-chance in 0.27 % of cases, as one is by 3."""
+"""Standard deviations by which snapping may change a wave vector; by chance two components exceed
+it in 0.27 % of cases, as one component exceeds 3."""
 _SAME = 0.01
-"""By how much a cell of the same lattice may differ in its vectors and its solid share, and a wave
-without standard deviations in its length; of the right lattice that was 0.7 % at most."""
+"""Tolerance [-] between cells of the same lattice, for lattice vectors and solid share, and for the
+length of a wave without standard deviations; for the right lattice it was 0.7 % at most."""
 _CRITICAL = "load kind negative_before negative_after"
 _WAVES = {"square": [(np.pi, np.pi)], "triangular": [(np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)]}
-"""Of the modes by stacking, in the order of ``FAMILIES``: phases along a1 and a2 [rad]."""
+"""Phases of the modes along a1 and a2 [rad], by stacking, in the order of ``FAMILIES``."""
 
 FoundModes = tuple[tuple[LatticeMode, ...], ModeParameters | None, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
 class HomogenizationRun(StagedRun[HomogenizationCase]):
-    """The stages of a homogenized specimen.
+    """Runs the stages of a homogenized specimen.
 
     All raise InputError if the case can't be homogenized, and MissingDependencyError without
     dolfinx.
@@ -102,13 +102,13 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @cached_property
     def virtual(self) -> Run:
-        """The virtual experiment."""
+        """The run of the virtual experiment, in the folder ``experiment``."""
         return Run(self.case.virtual, self.folder / "experiment", self.progress)
 
     def mode(self) -> FoundModes:
-        """The modes, the parameters they were measured with, and warnings; leaves ``mode.json``.
+        """The modes, their measured parameters, and warnings; writes ``mode.json``.
 
-        No modes where they are computed, and no parameters where they are not measured.
+        Modes are empty if they are computed, parameters are None if they are not measured.
         """
         path = self.folder / "mode.json"
 
@@ -117,7 +117,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             write_json(path, to_plain(dict(zip(names, self._found_modes(), strict=True))))
             return (path,)
 
-        _ = self.result  # a stage of its own, in which all ranks take part
+        _ = self.result  # a separate stage, in which all ranks take part
         self.do("mode", self._mode_key, work)
         with reading(path, "a mode", "remove it"):
             content = read_json(path)
@@ -127,9 +127,9 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             return tuple(found), known, tuple(content["warnings"])
 
     def homogenize(self) -> dict[str, Any]:
-        """Follow the homogenized specimen; leaves ``homogenized.json``, ``.h5``, and its RVEs.
+        """Simulate the homogenized specimen; writes ``homogenized.json``, ``.h5``, and its RVEs.
 
-        Under mpirun the ranks share RVEs out.
+        Under mpirun the RVEs are distributed over the ranks.
         """
         path, fields = self.folder / "homogenized.json", self.folder / "homogenized.h5"
         modes, parameters, _ = self.mode()
@@ -165,7 +165,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             return dict(read_json(path))
 
     def report(self) -> dict[str, Any]:
-        """Compare with the direct simulation; leaves ``report.html`` and ``summary.json``."""
+        """Compare with the direct simulation; writes ``report.html`` and ``summary.json``."""
         path, page = self.folder / "summary.json", self.folder / "report.html"
         data = self._data()
 
@@ -182,7 +182,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         return dict(read_json(path))
 
     def all(self) -> dict[str, Any]:
-        """All stages that are not finished; returns the content of ``summary.json``.
+        """Run all unfinished stages; returns the content of ``summary.json``.
 
         Raises InputError if another process works in the folder.
         """
@@ -212,7 +212,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @cached_property
     def _cell(self) -> UnitCell:
-        """The RVE's mesh: that of modes from a file, or 2 x 2 cells, a hole at the origin."""
+        """The RVE: the cell of the modes' file, or else 2 x 2 cells with a hole at the origin."""
         with requiring_dolfinx("homogenization needs"):
             from modeharvest.fem.lattice.cells import UnitCell
         if (given := self._computed) is not None:
@@ -221,7 +221,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @cached_property
     def _computed(self) -> ModeSet | None:
-        """Modes from a file of ``modeharvest modes``: of the specimen's lattice or a mesh's."""
+        """Modes in a file of ``modeharvest modes``, checked unless a mesh is given; or None."""
         mode, specimen = self.case.mode, self.case.experiment.specimen
         if not (isinstance(mode, FileMode) and mode.is_computed):
             return None
@@ -241,7 +241,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @cached_property
     def _families(self) -> list[PlaneWaves]:
-        """Waves of the modes whose families are given, in the lattice's coordinates."""
+        """Waves of the modes given as mode families, in the lattice's coordinates; or none."""
         mode, pitch = self.case.mode, self.case.experiment.specimen.pitch
         if not isinstance(mode, FileMode) or mode.is_computed:
             return []
@@ -258,7 +258,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @cached_property
     def _primitive(self) -> UnitCell:
-        """One cell of the specimen's lattice, a hole's centre at the origin."""
+        """The primitive cell of the specimen's lattice, with a hole's centre at the origin."""
         with requiring_dolfinx("homogenization needs"):
             from modeharvest.fem.lattice.cells import hexagonal, square
 
@@ -268,13 +268,13 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @property
     def _vectors(self) -> FloatArray:
-        """(2, 2) of the lattice as rows [mm]."""
+        """(2, 2) primitive vectors of the lattice, as rows [mm]."""
         given = self._computed
         return self.case.experiment.specimen.vectors if given is None else given.primitive
 
     @cached_property
     def result(self) -> Result | None:
-        """The correlation that the mode was measured by, if it was."""
+        """Result of the correlation that measured the mode; None if it is not measured."""
         mode = self.case.mode
         if isinstance(mode, FileMode):
             return None if mode.is_computed or self._families else Result.read(mode.path)
@@ -284,19 +284,19 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @property
     def _measured_strain(self) -> float:
-        """Of the image that shows the mode [-]."""
+        """Nominal strain of the image in which the mode is measured [-]."""
         strains, strain = self.case.experiment.strains, getattr(self.case.mode, "strain", None)
         return strains[-1] if strain is None else float(strain)
 
     @property
     def _numbers(self) -> tuple[int, ...]:
-        """Of the modes to use, from 0."""
+        """Numbers of the modes to use, from 0."""
         specimen, given = self.case.experiment.specimen, self._computed
         every = range(len(FAMILIES[specimen.stacking](specimen) if given is None else given.shapes))
         return tuple(k - 1 for k in self.case.mode.numbers) or tuple(every)
 
     def _modes_of(self, parameters: FloatArray) -> tuple[LatticeMode, ...]:
-        """The measured modes that are used, of all their parameters in a row."""
+        """The measured modes to use; ``parameters``: those of all these modes, concatenated."""
         assert self.result is not None
         modes, given = self.result.ansatz.modes, list(parameters)
         specimen, found = self.case.experiment.specimen, list[LatticeMode]()
@@ -334,7 +334,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             what = f"{max(numbers) + 1} free mode(s), as {specimen.stacking} stacking has"
             got = f"{free} of {len(modes)}; give the numbers of those to use"
             raise InputError(f"mode: expected a result with {what}, got {got}")
-        pair: ImagePair | None = None  # that the mode was measured in, if it is there
+        pair: ImagePair | None = None  # in which the mode was measured, if available
         if isinstance(self.case.mode, MeasuredMode):
             images = ImageSet.read(self.virtual.folder / "images")
             pair = images.pair(self._measured_strain, camera=self.case.correlation.camera)
@@ -354,7 +354,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
     def _deviations(
         self, found: Sequence[LatticeMode], parameters: ModeParameters
     ) -> tuple[float, ...]:
-        """By how many standard deviations snapping changed a wave vector of each mode, at most."""
+        """Largest change of a wave vector by snapping, for each mode [standard deviations]."""
         assert self.result is not None
         if parameters.by_model_error is None:
             return ()
@@ -369,7 +369,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
     def _far_waves(
         self, found: Sequence[LatticeMode], deviations: Sequence[float] = ()
     ) -> tuple[str, ...]:
-        """Refuse modes that snapping changed by more than error bars allow, or warn of them."""
+        """Refuse modes that snapping changed by more than error bars allow; or return warnings."""
         warnings = list[str]()
         for k, mode in enumerate(found):
             change, most = float(mode.wave_change.max()), f"{_SAME:.0%} of their lengths"
@@ -385,7 +385,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         return tuple(warnings)
 
     def _parameters(self, result: Result, pair: ImagePair | None) -> ModeParameters:
-        """With the covariances that the result, and its images where they are there, have."""
+        """Mode parameters with covariances, of the result and, if given, its images."""
         known, ansatz = result.errors or Covariance(result.covariance(), None), result.ansatz
         if pair is not None:
             images, pitch = ImageNoise.of(result.noise_sd), self.case.experiment.specimen.pitch
@@ -400,7 +400,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         return ModeParameters(names, units, result.unknowns[at], noise, error, larger)  # type: ignore[arg-type]
 
     def _fields(self, modes: Sequence[LatticeMode]) -> list[ModeField]:
-        """phi in the RVE's coordinates; those that are not given are computed."""
+        """Mode fields phi in the RVE's coordinates; computed if no modes are given."""
         if modes:
             return [mode.snapped for mode in modes]
         if self._computed is not None:
@@ -422,7 +422,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
         return list(real_modes(cell, state, [waves[k] for k in self._numbers]).shapes)
 
     def _body(self, modes: Sequence[ModeField]) -> HomogenizedBody:
-        """The macroscopic finite elements with their RVEs."""
+        """The macroscopic finite element model with its RVEs."""
         experiment, how, cell = self.case.experiment, self.case.homogenization, self._cell
         from modeharvest.fem.lattice.micromorphic.body import read_body_mesh
         from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody
@@ -447,7 +447,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
     @cached_property
     def _edge_shifts(self) -> tuple[float, float]:
-        """By how much the lattice is longer and higher at each end [mm]."""
+        """Extension of the lattice at each plate and at each side [mm]."""
         from modeharvest.fem.lattice.micromorphic.edges import edge_shifts
 
         how, of = self.case.homogenization, self.case.experiment
@@ -464,7 +464,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
     def _exported(
         self, found: Homogenized, body: HomogenizedBody, measured: MeasuredModes | None
     ) -> list[Path]:
-        """Write the RVE of each position, with the state before the critical point, too."""
+        """Write the RVE of each position, also with the state before the critical point."""
         before = [found.critical.state] if found.critical else []
         states = sorted([*before, *found.states], key=lambda state: state.load)
         points, count = len(body.places), len(body.rves)
@@ -510,7 +510,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
 
 def _own_states(body: HomogenizedBody, state: HomogenizedState) -> list[tuple[int, RVEState]]:
-    """Those of this rank's RVEs in a state, with the RVEs' numbers."""
+    """States of this rank's RVEs in a state of the body, with the RVEs' numbers."""
     return [
         (int(k), rve.equilibrium(q, rve.cell.reduction.displacement(w)))
         for k, w in zip(body.own, body.fluctuations(state.value), strict=True)

@@ -1,4 +1,4 @@
-"""What a homogenized specimen's run found: its fields, its summary, what the report shows."""
+"""Results of a homogenized specimen: its fields, its summary, the data of the report."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 FORMAT = "modeharvest-homogenized-1"
 _QUARTERS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
-"""Signs of x and y."""
+"""Signs of x and y in the four quarters of the specimen."""
 _REVERSED = [0, 3, 2, 1, 7, 6, 5, 4]
-"""The nodes of a Q8 element the other way round."""
+"""Node order of a Q8 element with reversed orientation, as after mirroring."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,18 +44,18 @@ class StateFields:
     """Nominal strain [-]."""
     displacement: FloatArray
     amplitudes: FloatArray
-    """(n, 2) u [mm] and (n, m) v_i [mm], NaN where there is no lattice."""
+    """(n, 2) u [mm] and (n, m) v_i [mm] at the nodes; NaN where there is no lattice."""
     strains: FloatArray
     stresses: FloatArray
-    """(p, 4 + 3 m) F̄, v, g and P̄, Pi, Lambda at the points of the lattice, row by row."""
+    """(p, 4 + 3 m) F̄, v, g and P̄, Pi, Lambda at the lattice's points, tensors row by row."""
     microstructure: FloatArray
-    """(p, k, 2) displacement of the RVE's nodes at each point, from its middle [mm]."""
+    """(p, k, 2) displacement of the RVE's nodes at each point, relative to its centre [mm]."""
 
 
 def write_fields(found: Homogenized, body: HomogenizedBody, path: Path) -> None:
-    """Write mesh and states of the whole as HDF5, a group ``states/K`` each.
+    """Write mesh and states of the whole specimen as HDF5, a group ``states/K`` for each state.
 
-    Of a quarter its mirror images are written too; its points stay those of the quarter.
+    If a quarter was simulated, fields are mirrored; the points remain those of the quarter.
     """
     signs, every, count = _QUARTERS[: body.copies], list[StateFields](), len(body.rves)
     for state in found.states:  # on all ranks, each of which has some of the RVEs
@@ -80,7 +80,7 @@ def write_fields(found: Homogenized, body: HomogenizedBody, path: Path) -> None:
 
 
 def _unfolded(mesh: Mesh, signs: FloatArray) -> Mesh:
-    """A mesh and its mirror images, one after the other; nodes on mirrors are there twice."""
+    """A mesh and its mirror images, concatenated; nodes on mirror lines are duplicated."""
     nodes = np.concatenate([mesh.nodes * sign for sign in signs])
     first = len(mesh.nodes) * np.arange(len(signs))
     cells = [
@@ -95,16 +95,16 @@ class HomogenizedFields:
     """The content of ``homogenized.h5``."""
 
     mesh: Mesh
-    """Macroscopic, of the whole specimen [mm]."""
+    """Macroscopic mesh of the whole specimen [mm]."""
     rve: Mesh
-    """Of the first RVE at a point, from its middle [mm]."""
+    """Mesh of the first RVE at a point, relative to its centre [mm]."""
     points: FloatArray
-    """(p, 2) where the RVEs are [mm]; of a quarter its own."""
+    """(p, 2) positions of the RVEs [mm]; only those in the quarter if a quarter is simulated."""
     states: tuple[StateFields, ...]
 
     @classmethod
     def read(cls, path: Path) -> HomogenizedFields:
-        """What :func:`write_fields` wrote."""
+        """Read a file of :func:`write_fields`."""
         with open_hdf5(path, "a homogenized specimen", form=FORMAT) as file:
             states = file.get("states", {})
             found = tuple(read_values(states[key], StateFields) for key in sorted(states))
@@ -113,7 +113,7 @@ class HomogenizedFields:
 
 
 def response_of(found: Homogenized) -> Response:
-    """The numbers of a followed specimen."""
+    """Loads, forces, energies and critical load of a simulated homogenized specimen."""
     states = tuple(
         StateNumbers(s.load, s.force, s.energy, s.branch, s.negative_eigenvalues)
         for s in found.states
@@ -129,34 +129,34 @@ class HomogenizationData:
     found: Mapping[str, Any]
     """The content of ``homogenized.json``."""
     direct: Response
-    """Of the direct simulation; without states where it is of another specimen or load."""
+    """Response of the direct simulation; no states if its specimen or load is another."""
     path: Mapping[str, Any]
-    """``Solution.info["path"]`` of it."""
+    """``Solution.info["path"]`` of the direct simulation."""
     modes: tuple[LatticeMode, ...]
     parameters: ModeParameters | None
-    """None where they were not given, or not measured."""
+    """Measured mode parameters; None if the modes were not measured."""
     warnings: tuple[str, ...]
-    """Of the mode's measurement."""
+    """Warnings of the mode's measurement."""
     fields: HomogenizedFields
     measured: Result | None
     measured_strain: float
-    """What was measured in the specimen's own images, and at which strain; None if nothing was."""
+    """Result measured in the specimen's images (None if there is none), and its strain [-]."""
     command: str
 
     @property
     def compared(self) -> StateFields | None:
-        """The homogenized state at the strain of the measured one."""
+        """The homogenized state at the measured strain; None if there is none."""
         near = [s for s in self.fields.states if abs(s.load - self.measured_strain) < 1e-9]
         return near[0] if near and self.measured is not None else None
 
     def measured_at(self, points: FloatArray) -> FloatArray:
-        """(n, 3) v0 and v1 as they were measured, at points (n, 2) [mm]."""
+        """(n, 3) measured v0 and v1 [mm] at points (n, 2) [mm]."""
         assert self.measured is not None
         (x, y), a, of = points.T[..., None], self.measured.unknowns, self.measured.ansatz
         return np.hstack([of.v0(a, x, y)[:, 0], of.v(0, a, x, y)])
 
     def measured_sd(self, points: FloatArray) -> FloatArray:
-        """(n, 3) their standard deviations by the measurement's."""
+        """(n, 3) standard deviations of the measured v0 and v1 [mm] at points (n, 2) [mm]."""
         (x, y), known = points.T[..., None], self.parameters
         assert self.measured is not None
         errors = field_errors(self.measured, x, y, np.asarray(known and known.of_fields))
@@ -164,7 +164,7 @@ class HomogenizationData:
 
 
 def not_reached(response: Mapping[str, Any], count: int) -> list[str]:
-    """A warning if there are fewer states than the ``count`` that was asked for."""
+    """A warning if there are fewer states than the specified ``count``."""
     found = len(response["states"])
     text = f"{count - found} of {count} states were not reached: {response['outcome']}"
     return [text] if found < count else []
@@ -215,11 +215,11 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
 
 
 def _compared(data: HomogenizationData) -> dict[str, dict[str, float] | None]:
-    """Of u with v0, and of v1 with v1: rms homogenized, measured, of their difference [mm].
+    """Compare u with v0, and v1 with v1: rms of homogenized, measured and their difference [mm].
 
-    Over the lattice; of v0 that of its length; with the measured one's standard deviation, and the
-    difference over that, a component. Of several modes v1 isn't compared: which one is
-    strongest, and their signs, are those of one branch of several that are alike.
+    Over the lattice; for v0 rms of its length. Also the standard deviation of the measured field,
+    and the difference relative to it, per component. With several modes v1 isn't compared: which
+    one is strongest, and their signs, depend on which of several equivalent branches is found.
     """
     state, mesh = data.compared, data.fields.mesh
     found: dict[str, dict[str, float] | None] = {"displacement": None, "amplitude": None}
@@ -245,9 +245,9 @@ def _compared(data: HomogenizationData) -> dict[str, dict[str, float] | None]:
 
 
 def aligned(homogenized: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Amplitude fields, alike in shape, the first with the sign of the second where both are known.
+    """Two amplitude fields of equal shape, the first with its overall sign matched to the second.
 
-    A pattern and its mirror image are one buckled state.
+    A pattern and its mirror image are the same buckled state. NaN values are ignored.
     """
     sign = -1.0 if float(np.nansum(homogenized * measured)) < 0.0 else 1.0
     return sign * homogenized, measured

@@ -1,1 +1,1 @@
-"""Runs that identify material and supports."""
+"""Runs that identify material parameters and boundary conditions from images and forces."""

@@ -1,9 +1,9 @@
-"""Material and supports to be identified as a case: model, unknowns, and data or a twin.
+"""Case of an identification of material and supports: model, unknowns, and data or a twin.
 
-A case has a table ``[experiment]``, the model: specimen, mesh, nominal strains of the states, and
-the values of what isn't unknown; ``[unknowns]``, each with its start and bounds; and either
-``[data]``, files of images or displacement fields and the load cell's readings, or ``[twin]`` with
-``[imaging]``: data made by the program itself, on another mesh than the one that identifies.
+The table ``[experiment]`` is the model: specimen, mesh, nominal strains of the states, and the
+values of known parameters. ``[unknowns]`` has each unknown with its initial guess and bounds. The
+data are either ``[data]``, files of images or displacement fields and readings of the load cell,
+or ``[twin]`` with ``[imaging]``: synthetic data, made on another mesh than that of the model.
 """
 
 from __future__ import annotations
@@ -29,43 +29,43 @@ from modeharvest.util.errors import InputError, require_within
 
 @dataclass(frozen=True)
 class MeasuredData:
-    """What a test has left; names of files are relative to the case's."""
+    """Data of a test; file names are relative to the folder of the case file."""
 
     reference: str = ""
     deformed: tuple[str, ...] = ()
-    """Images: of the undeformed state, and of each strain in the order of the test."""
+    """Image files: of the undeformed state, and of each strain in the order of the test."""
     pixel_size: float | None = None
-    """[mm/px]."""
+    """Size of a pixel on the specimen [mm/px]."""
     placement: Literal["found", "centred"] = "found"
-    """Whether the reference's holes show where the specimen is, then refined with the unknowns, or
-    its middle is the middle of the images."""
+    """Position of the specimen: "found" by its holes in the reference image, then refined with the
+    unknowns; or "centred", with its centre at the centre of the images."""
     light_degree: int | None = 0
-    """Of the polynomials by which gain and offset of the light differ between images; None where
-    they don't."""
+    """Degree (0 to 6) of the polynomials for the difference in gain and offset of the illumination
+    between images; None if there is no difference."""
     distortion: str = ""
-    """Of the lens: a file of modeharvest (JSON) or of a calibration program; images stay
-    as they are, and points are put where it shows them."""
+    """Lens distortion: a file of modeharvest (JSON) or of a calibration program. Images are not
+    resampled; points are mapped to their distorted positions."""
     noise_sd: float | None = None
-    """Of the camera, in each image [grey levels of the files]; else estimated from the images."""
+    """Standard deviation of each image's noise [grey levels of the files]; by default estimated."""
     fields: tuple[str, ...] = ()
     y_axis: Literal["up", "down"] | None = None
     field_sd_mm: float | None = None
-    """Displacement fields in mm by any DIC code, one for each strain, instead of images, from the
-    specimen's middle; where y grows unless columns tell; standard deviation per component."""
+    """Instead of images, displacement fields [mm] of any DIC code, one per strain, origin at the
+    specimen's centre; direction of y if columns don't tell; standard deviation per component."""
     forces_N: tuple[float, ...] = ()
     thickness_mm: float | None = None
     forces_N_per_mm: tuple[float, ...] = ()
-    """Readings of the load cell at each strain, compression positive: with the specimen's
-    thickness, or by thickness."""
+    """Readings of the load cell at each strain, compression positive: in N, with the specimen's
+    thickness in mm, or in N per mm of thickness."""
     force_sd: float | None = None
     """Standard deviation of the load cell, in the unit of the forces."""
     rigid_motion: bool = False
-    """Whether specimen and camera may have moved against each other between the images: then a
-    shift and a turn of each state are found, too, of up to some 10 px."""
+    """Whether specimen and camera may have moved relative to each other between the images. If so,
+    a translation and a rotation of each state are identified, too, of up to some 10 px."""
     strain_sd: float = 1e-5
-    """Standard deviation of nominal strains, for states found by an amplitude [-]."""
+    """Standard deviation of the nominal strains [-], used for states given by an amplitude."""
     critical_strain: tuple[float, float] | None = None
-    """Nominal strains of the last frame of a film without the pattern and of the first with it."""
+    """Nominal strains [-] of the last frame of a film without pattern and the first with it."""
 
     def __post_init__(self) -> None:
         if self.critical_strain and not 0.0 < self.critical_strain[0] < self.critical_strain[1]:
@@ -96,7 +96,7 @@ class MeasuredData:
 
     @property
     def forces(self) -> Readings | None:
-        """By thickness [N/mm]; None without any."""
+        """Readings of the load cell per thickness [N/mm]; None if there are none."""
         values = self.forces_N or self.forces_N_per_mm
         if not values or self.force_sd is None:
             return None
@@ -106,22 +106,22 @@ class MeasuredData:
 
 @dataclass(frozen=True)
 class TwinTruth:
-    """What is true in a test that the program makes itself."""
+    """True values of a synthetic test, from which the program makes its data."""
 
     material: Material = field(default_factory=Ogden)
     mesh_size: float = 0.25
-    """Edge length of the elements that the data are made with [mm]."""
+    """Edge length of the elements of the simulation that makes the data [mm]."""
     travel: float = 1.0
     tilt: float = 0.0
     values: dict[str, float] = field(default_factory=dict)
-    """Of other unknowns, such as "holes.diameter[0,0]", "right.x[2]" or "v0[0].x[2,0]" [mm]."""
+    """Other unknowns' true values [mm]: "holes.diameter[0,0]", "right.x[2]", "v0[0].x[2,0]" etc."""
     imperfection: Imperfection = field(default_factory=Imperfection)
-    """Scatter of the holes, beside that."""
+    """Scatter of the holes, added to those values."""
     force_sd: float = 0.0
-    """Of the load cell; 0 for a test without forces [N/mm]."""
+    """Standard deviation of the load cell [N/mm]; 0 for a test without forces."""
     force_seed: int = 0
     frame_strain: float = 0.0
-    """From frame to frame of a film that brackets the critical strain [-]; 0 for none."""
+    """Strain between frames of a film that brackets the critical strain [-]; 0: no film."""
 
     def __post_init__(self) -> None:
         require_within("twin: expected frame_strain", self.frame_strain, 0.0)
@@ -129,7 +129,7 @@ class TwinTruth:
         require_within("twin: expected force_sd [N/mm]", self.force_sd, 0.0)
 
     def every(self, experiment: Experiment) -> dict[str, float]:
-        """Values of parameters of the model by their names, the material's aside."""
+        """True values of the model's parameters by name, without those of the material."""
         count = len(experiment.strains)
         own = {name: v for name, v in self.values.items() if Term.named(name, count) is None}
         found = {TRAVEL: self.travel, TILT: self.tilt, **own}
@@ -141,7 +141,7 @@ class TwinTruth:
         return found
 
     def value(self, name: str) -> float | None:
-        """Of a parameter by its name, holes aside; None if it has none of that name."""
+        """True value of a parameter, except of holes; None if there is no such parameter."""
         if (known := {TRAVEL: self.travel, TILT: self.tilt, **self.values}).get(name) is not None:
             return known[name]
         if name.startswith(("left.", "right.", "v0[", "v1[")):
@@ -155,7 +155,7 @@ class TwinTruth:
 
 @dataclass(frozen=True)
 class OtherLaw:
-    """Another material that the data are compared with, and its unknown constants."""
+    """Another material model to be identified from the data, with its unknown constants."""
 
     name: str
     material: Material
@@ -163,7 +163,7 @@ class OtherLaw:
 
 
 class IdentificationCase(CaseModel):
-    """A model with unknowns, and the data that they are identified from."""
+    """A model with unknown parameters, and the data from which they are identified."""
 
     table = "unknowns"
 
@@ -172,20 +172,20 @@ class IdentificationCase(CaseModel):
     )
     unknowns: dict[str, Unknown]
     laws: tuple[Annotated[OtherLaw, of_kind(MATERIALS, "laws.material", "material")], ...] = ()
-    """Other materials to be identified from the same data, and compared by their evidence."""
+    """Other material models, identified from the same data and compared by their evidence."""
     data: MeasuredData | None = None
     twin: Annotated[TwinTruth | None, of_kind(MATERIALS, "twin.material", "material")] = None
     imaging: Annotated[
         ImagingSpec, of_kind({"camera": CameraDistortion}, "imaging.distortion", "distortion")
     ] = ImagingSpec()
     finer_mesh_size: float | None = None
-    """Of the mesh whose residual the last steps take [mm]; by default 0.7 of the model's."""
+    """Element size of the mesh for the last steps' residual [mm]; by default 0.7 of the model's."""
 
     _base: Path = PrivateAttr(Path())
 
     @classmethod
     def read(cls, name: str | Path) -> Self:
-        """Read a case as every other; the files it names are found beside its own."""
+        """Read a case as for any kind; paths in it are relative to the folder of its file."""
         case = super().read(name)
         case._base = Path(name).parent
         return case
@@ -216,14 +216,14 @@ class IdentificationCase(CaseModel):
         return self
 
     def with_law(self, law: OtherLaw) -> IdentificationCase:
-        """The case with another material, whose constants take the places of this one's."""
+        """The case with another material; its unknown constants replace those of this material."""
         own = vars(self.experiment.material)
         rest = {n: u for n, u in self.unknowns.items() if n.partition("[")[0] not in own}
         experiment = replace(self.experiment, material=law.material)
         return self.model_copy(update={"experiment": experiment, "unknowns": law.unknowns | rest})
 
     def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values, materials by their kind."""
+        """The case as plain JSON values; materials have their ``kind``."""
         content = super().plain()
         content["experiment"]["material"] = with_kind(self.experiment.material, MATERIALS)
         content["experiment"]["specimen"] = self.experiment.specimen.plain()

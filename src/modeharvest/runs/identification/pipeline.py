@@ -1,9 +1,9 @@
-"""Material and supports identified from images and forces, in a folder that can be resumed.
+"""Material and supports identified from images and forces, in stages that can be resumed.
 
 ::
 
-    images/ forces.json                 data       of a twin: what a test of known truth would leave
-    solution.h5 solution.vtu            identify   the model's states with what was found
+    images/ forces.json                 data       twin only: synthetic data of known truth
+    solution.h5 solution.vtu            identify   the model's states with the identified values
     report.html summary.json
 """
 
@@ -68,14 +68,14 @@ from modeharvest.util.typed import to_plain
 
 _FRAME = {"centre": (0.005, "mm"), "orientation": (0.005, "rad"),
           "shift": (0.1, "mm"), "turn": (0.1, "rad")}  # fmt: skip
-"""How far unknowns of the camera's frame may be off where they start, lengths over the specimen's,
-and their units."""
+"""Possible errors of the initial guesses of the camera frame's unknowns (lengths relative to the
+specimen's), and units."""
 _DEGREE, _FINE_DEGREE = 3, 4
-"""Of the polynomials over an element: of the model, and of the finer mesh and of twins."""
+"""Polynomial degrees of elements: of the model's mesh, and of the finer mesh and of twins."""
 _OTHER = {"buckled+": "buckled-", "buckled-": "buckled+"}
-_NEAR = 100.0  # strain_sd from the critical strain: nearer to it amplitudes are tried
+_NEAR = 100.0  # distance from the critical strain [strain_sd], below which amplitudes are tried
 _SAME_MM = 1e-5
-"""By which states found step by step and along the whole path may differ."""
+"""Tolerance between states found step by step and those found along the whole path [mm]."""
 _WRINKLES = 0.544
 """Stretch at which a free surface of a neo-Hookean material becomes unstable in plane strain: Biot,
 Appl. Sci. Res. A 12 (1963) 168-182."""
@@ -84,13 +84,13 @@ _LIBRARIES = ("numpy", "scipy", "numba", "h5py", "fenics-dolfinx")
 
 @dataclass(frozen=True)
 class IdentificationRun(StagedRun[IdentificationCase]):
-    """The stages of an identification."""
+    """Runs the stages of an identification."""
 
     source: str = "EXPERIMENT.toml"
     """The case's name, for the command in the report."""
 
     def all(self) -> dict[str, Any]:
-        """Do everything that is not finished; returns the content of ``summary.json``.
+        """Run all unfinished stages; returns the content of ``summary.json``.
 
         Raises InputError if the data can't be used or the model doesn't reach their states, and
         MissingDependencyError without dolfinx.
@@ -114,7 +114,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     @cached_property
     def _files(self) -> tuple[Path, ...]:
-        """Those that the case names."""
+        """The data files named in the case: reference and deformed images, or fields."""
         if (data := self.case.data) is None:
             return ()
         names = data.fields or (data.reference, *data.deformed)
@@ -133,7 +133,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     @property
     def _lens(self) -> tuple[Path, ...]:
-        """The file of the lens, if there is one."""
+        """The file of the lens distortion, as a tuple; empty if there is none."""
         data = self.case.data
         return (self.case._base / data.distortion,) if data and data.distortion else ()
 
@@ -143,7 +143,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return ParametricTest.meshed(experiment, names, degree)
 
     def _make_twin(self, twin: TwinTruth | None) -> list[Path]:
-        """Images of the true states, and readings of a load cell."""
+        """Write images of the true states, and readings of a load cell; returns the files."""
         assert twin is not None
         true = replace(self.case.experiment, material=twin.material, mesh_size=twin.mesh_size)
         values = twin.every(true)
@@ -185,7 +185,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         h5, vtu, page, path = (self.folder / name for name in names)
         solution.write(h5)
         solution.write_vtu(vtu)
-        model.with_critical = False  # there, displacement along the mode costs nothing
+        model.with_critical = False  # at that point, displacement along the mode needs no energy
         warnings = _path_warnings(model, found.minimum.unknowns[: len(model.names)])
         warnings += [text for s in found.states for text in _surface_warnings(s)]
         summary = self._summary(found, model)
@@ -199,7 +199,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return [h5, vtu, page, path]
 
     def _best(self, case: IdentificationCase, *data: Any) -> tuple[Identified, Any, list[str]]:
-        """A case's unknowns, on the other branch if they fit better there, and the model."""
+        """Identified unknowns, the model and notes; on the other branch if it fits better."""
         named = case.experiment.branches[0]
         with suppress(UnlikeDataError):
             return *self._identified(case, *data, unlike_is_error=True), []
@@ -208,7 +208,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         experiment = replace(case.experiment, branches=(_OTHER[named],))
         other = case.model_copy(update={"experiment": experiment})
         text = f"the specimen is on {_OTHER[named]}: on {named} the model fits worse"
-        with suppress(InputError):  # it doesn't reach the states, or they are as unlike
+        with suppress(InputError):  # states not reached, or unlike the data, too
             return *self._identified(other, *data, unlike_is_error=True), [text]
         found, model = self._identified(case, *data)
         is_buckled = any(state.branch in _OTHER for state in found.states)
@@ -224,7 +224,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         forces: Readings | None, px: float, frame: dict[str, Unknown],
         *, unlike_is_error: bool = False,
     ) -> tuple[Identified, Any]:  # fmt: skip
-        """A case's unknowns, and the camera's, by the data; and the model."""
+        """Identify the unknowns of a case and of the camera's frame; returns the model, too."""
         experiment = case.experiment
         terms = terms_of(case.unknowns, len(experiment.strains))
         unknowns = {name: unknown for name, unknown in case.unknowns.items() if name not in terms}
@@ -262,7 +262,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return min((found, model), other, key=lambda pair: pair[0].minimum.equations.cost)
 
     def _beside_critical(self, found: Identified, fine: Any) -> dict[str, Unknown]:
-        """Amplitudes of states so near the critical point that their strain hardly says them."""
+        """Unknown amplitudes of states so near the critical point that strain hardly fixes them."""
         critical, experiment = fine.critical_strain, fine.experiment
         travel = dict(zip(found.unknowns, found.minimum.unknowns, strict=True)).get("travel", 1.0)
         off = np.abs(travel * np.array(experiment.strains) - (critical or np.inf))
@@ -273,7 +273,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return {name: Unknown(start, (-reach, reach)) for name in sorted(names)}
 
     def _laws(self, found: Identified, *data: Any) -> tuple[list[dict[str, Any]], list[str]]:
-        """The evidence for each of the case's materials, and which is the best, in words."""
+        """The evidence for each material of the case, and a text that compares them."""
         results = {type(self.case.experiment.material).__name__: found}
         for law in self.case.laws:
             results[law.name], _, _ = self._best(self.case.with_law(law), *data)
@@ -295,7 +295,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
     def _data(
         self, mesh: Mesh
     ) -> tuple[list[StateObservation | None], Readings | None, float, dict[str, Unknown]]:
-        """Of each state, with the forces, the size of a pixel [mm], and the camera's unknowns."""
+        """Data of each state, forces, pixel size [mm], unknowns of the camera's frame."""
         twin, data = self.case.twin, self.case.data
         if twin is not None:
             readings = np.array(read_json(self.folder / "forces.json")["forces_N_per_mm"])
@@ -329,7 +329,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
     @property
     def _strains(self) -> Readings:
-        """Of the states; and the critical one by a film: between two frames, all alike likely."""
+        """Strains of the states, and the critical strain of a film: uniform between two frames."""
         e, data = np.array(self.case.experiment.strains), self.case.data
         sds = np.full(len(e), 1e-5 if data is None else data.strain_sd)
         path = self.folder / "forces.json"
@@ -340,7 +340,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return Readings(np.append(e, np.mean(frames)), np.append(sds, sd))
 
     def _exposed(self, images: ImageSet, mesh: Mesh) -> Iterator[ImageData]:
-        """The images of a twin, through a lens that is known."""
+        """The image data of a twin, for each strain; its lens distortion is known."""
         lens, grid = self.case.imaging.lens(images.grid.shape), images.grid
         light = partial(alike, degree=0) if self.case.imaging.sensor.flicker else None
         reference, pixels = images.reference(camera=True), MeshPixels(mesh)
@@ -353,7 +353,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
     def _photographed(
         self, data: MeasuredData
     ) -> tuple[list[ImagePair], FloatArray | None, Distortion | None]:
-        """The images of the files, where the reference shows the specimen, and the lens."""
+        """Image pairs of the files, the specimen's place in the reference, lens distortion."""
         reference = read_reference(self._files[0])
         others = [read_frame(path, reference).image for path in self._files[1:]]
         lens = next(map(read_distortion, self._lens), None)
@@ -364,7 +364,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return [ImagePair(reference.image, other, grid) for other in others], place, lens
 
     def _holes(self, found: Identified) -> tuple[list[dict[str, Any]] | None, dict[str, Any]]:
-        """The holes as found, if they are unknown; and true values of a twin's unknowns."""
+        """The identified holes (None if not unknown), and true values of a twin's unknowns."""
         experiment, twin = self.case.experiment, self.case.twin
         true = {} if twin is None else {name: twin.value(name) for name in found.unknowns}
         chosen = [k for k, name in enumerate(found.unknowns) if name.startswith("holes")]
@@ -374,7 +374,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         design = np.array([holes_of([name], [1.0], experiment).ravel() for name in names]).T
         off = (design @ found.values[chosen]).reshape(-1, len(PARTS))
         covariance = found.covariance_with_model_error[np.ix_(chosen, chosen)]
-        own = np.nan_to_num(covariance, posinf=1e6)  # of what nothing determines
+        own = np.nan_to_num(covariance, posinf=1e6)  # of undetermined unknowns
         variance = np.einsum("ij,jk,ik->i", design, own, design)
         sd = np.hypot(np.sqrt(variance), design @ found.mesh_error[chosen]).reshape(off.shape)
         values = {} if twin is None else twin.every(experiment)
@@ -389,7 +389,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         ], true  # fmt: skip
 
     def _unit(self, name: str) -> str:
-        """Of an unknown."""
+        """Unit of an unknown."""
         if frame := _FRAME.get(re.split(r"[_[]", name)[0]):
             return frame[1]
         experiment = self.case.experiment
@@ -398,7 +398,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         return parameter(name, experiment).unit
 
     def _critical(self, found: Identified, model: Any) -> dict[str, Any] | None:
-        """The critical strain of the model whose states were found last, and what was measured."""
+        """Critical strain of the model with the identified values, and its measured value."""
         last, reading = found.states[-1], self._strains
         is_datum, own = last.branch == "critical", found.minimum.unknowns[: len(model.names)]
         if (state := last if is_datum else model.critical_state(own)) is None:
@@ -448,15 +448,15 @@ class IdentificationRun(StagedRun[IdentificationCase]):
 
 
 def error_ratio(sizes: float) -> float:
-    """Ratio of the finer mesh's error to the model's, of the ratio of their elements' sizes.
+    """Ratio of the finer mesh's error to the model's; ``sizes``: ratio of their element sizes.
 
-    As fits most parameters of a specimen, by benchmarks/identification_statistics.py --fields.
+    Empirical, for most parameters of a specimen: benchmarks/identification_statistics.py --fields.
     """
     return float(0.02 * (sizes / 0.7) ** 5)
 
 
 def _path_warnings(model: Any, values: FloatArray) -> list[str]:
-    """Follow the whole path to states that were found step by step; what is wrong with them."""
+    """Follow the whole path to states found step by step; returns a warning if they differ."""
     near = model.near(values, False)
     try:
         whole = model.at(values, False)
@@ -471,7 +471,7 @@ def _path_warnings(model: Any, values: FloatArray) -> list[str]:
 
 
 def _surface_warnings(state: Any) -> list[str]:
-    """Whether a state compresses the material beyond what free edges bear, in words."""
+    """A warning if a state compresses the material so far that free edges are unstable."""
     F = np.eye(2) + element_gradients(state.mesh, state.displacement)
     if (least := float(np.linalg.svd(F, compute_uv=False).min())) > _WRINKLES:
         return []
@@ -482,7 +482,7 @@ def _surface_warnings(state: Any) -> list[str]:
 def run_identification(
     case: IdentificationCase | Mapping[str, Any] | str | Path, folder: Path | str, **how: Any
 ) -> dict[str, Any]:
-    """Identify a case's unknowns in a folder; returns what ``summary.json`` holds."""
+    """Identify a case's unknowns in a folder; returns the content of ``summary.json``."""
     source = str(case) if isinstance(case, (str, Path)) else "EXPERIMENT.toml"
     if isinstance(case, Mapping):
         case = checked(IdentificationCase, case, "case")

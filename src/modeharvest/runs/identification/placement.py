@@ -1,4 +1,4 @@
-"""Where a photograph shows a specimen: by the centres of its holes."""
+"""Position and rotation of a specimen in a photograph, by the centres of its holes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _HINT = "; check holes_x, holes_y and the image, or centre it and set data.place
 
 
 def found_place(image: FloatImage, grid: PixelGrid, specimen: Specimen) -> FloatArray:
-    """(3,) x and y of the specimen's middle [mm], and its turn [rad], in an image (rows, cols).
+    """(3,) x and y of the specimen's centre [mm] and its rotation [rad] in an image (rows, cols).
 
-    InputError if its material can't be found, or its holes are of another number or distance.
+    InputError if the material can't be found, or number or distance of the holes don't match.
     """
     pitch = float(np.linalg.norm(specimen.vectors, axis=1).min()) / grid.pixel_size
     try:

@@ -1,4 +1,4 @@
-"""An infinite lattice as a case: a TOML file, or a few lines of Python, checked beforehand.
+"""Case of an infinite lattice: a TOML file, or a few lines of Python, validated before the run.
 
 ::
 
@@ -6,13 +6,13 @@
     [lattice]      # kind = "square", "hexagonal", "tetrachiral", "hexachiral" or "file"
     [material]     # kind = "ogden" or "two-term-I1", and its constants
     [loading]      # kind = "uniaxial", "uniaxial-strain", "equibiaxial", "shear", "prescribed"
-    [search]       # up to which load, how finely
+    [search]       # largest load, resolution
     [dispersion]   # loads, points, bands
     [modes]        # which modes, which branches
     [study]        # optional: how the pattern depends on d/l, l, material and loading
 
-In Python: ``LatticeCase(lattice=SquareLattice(1.9, 1.5), loading=Loading("equibiaxial"))``. No
-lattice needs gmsh before its cell is meshed.
+In Python: ``LatticeCase(lattice=SquareLattice(1.9, 1.5), loading=Loading("equibiaxial"))``.
+gmsh is needed only when the cell is meshed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class LatticeSpec(Protocol):
-    """A lattice of which one primitive cell can be meshed."""
+    """Interface of lattices: their primitive cell can be meshed."""
 
     @property
     def pitch(self) -> float:
@@ -55,15 +55,15 @@ class LatticeSpec(Protocol):
 
     @property
     def symmetry(self) -> str:
-        """Without load: "square", "hexagonal" (60 degrees from a1 to a2) or "oblique"."""
+        """Symmetry without load: "square", "hexagonal" (60 deg from a1 to a2) or "oblique"."""
 
     def cell(self) -> UnitCell:
-        """The primitive cell, meshed; an InputError if there is no such lattice."""
+        """The primitive cell, meshed; InputError if no such lattice exists."""
 
 
 @dataclass(frozen=True)
 class SquareLattice:
-    """Holes in square stacking: l, d, and the edge length of the elements [mm]."""
+    """Holes in square stacking: pitch l, diameter d, edge length of the elements [mm]."""
 
     pitch: float = 1.9
     diameter: float = 1.5
@@ -79,7 +79,7 @@ class SquareLattice:
 
 @dataclass(frozen=True)
 class HexagonalLattice:
-    """Holes in hexagonal stacking: distance of centres, d, edge length of the elements [mm]."""
+    """Holes in hexagonal stacking: distance of centres l, diameter d, element edge length [mm]."""
 
     pitch: float = 1.386
     diameter: float = 1.28
@@ -98,13 +98,13 @@ class ChiralLattice:
     """Rings joined by ligaments that touch them tangentially: ``fem.lattice.cells.chiral``."""
 
     pitch: float = 1.9
-    """Distance of neighbouring rings' centres [mm]."""
+    """Distance between the centres of neighbouring rings [mm]."""
     mesh_size: float = 0.1
-    """[mm]."""
+    """Edge length of the elements [mm]."""
     ring_radius: float | None = None
     ring_thickness: float | None = None
     ligament_thickness: float | None = None
-    """Shares of ``pitch``; those that ``chiral`` states unless given [-]."""
+    """Dimensions divided by ``pitch`` [-]; by default those of ``chiral``."""
     handedness: str = "clockwise"
     """Either "clockwise" or "counterclockwise"."""
     ligaments = 4
@@ -133,24 +133,24 @@ class HexachiralLattice(ChiralLattice):
 
 @dataclass(frozen=True)
 class FileLattice:
-    """A cell of one's own, a mesh or a geometry: ``fem.lattice.files.read_cell``."""
+    """A cell read from a file, a mesh or a geometry: ``fem.lattice.files.read_cell``."""
 
     path: str
-    """The file; in a case file, relative to that file's folder."""
+    """Path of the mesh or geometry; in a case file, relative to that file's folder."""
     pitch: float
     """Unit cell size l [mm], the unit of wave lengths in spectra."""
     vectors: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """a1 and a2 as rows [mm]; None: a rectangle along x and y, as large as the material."""
+    """Lattice vectors a1 and a2, as rows [mm]; None: the bounding rectangle along x and y."""
     mesh_size: float | None = None
-    """Largest edge length [mm] where a geometry is meshed; None for a mesh."""
+    """Largest edge length of elements, for a geometry that is meshed [mm]; None for a mesh."""
     unit: str | None = None
-    """Of the file's own lengths, "m" or "um" for instance; None: mm, and asked for if unlikely."""
+    """Unit of lengths in the file, such as "m" or "um"; None: mm, refused if that is unlikely."""
     primitive: bool = True
-    """Of a supercell its primitive cell, which waves and modes then refer to; false: as it is."""
+    """Whether a supercell is reduced to its primitive cell, to which waves and modes refer."""
     symmetry = "oblique"
 
     def cell(self) -> UnitCell:
-        """The cell as the file has it, or its primitive one."""
+        """The cell in the file, or its primitive cell."""
         from modeharvest.fem.lattice.files import read_cell
         from modeharvest.fem.lattice.primitive import primitive_cell
 
@@ -175,16 +175,16 @@ class DispersionPlan:
     """Where the lowest eigenvalues are computed."""
 
     loads: tuple[float, ...] = ()
-    """[-]; none: 0, half the critical load and the critical one."""
+    """Loads e [-]; by default 0, half the critical load, and the critical load."""
     points: int = 60
-    """Wave vectors along the path; 0: no dispersion."""
+    """Number of wave vectors along the path; 0: no dispersion."""
     bands: int = 3
-    """Eigenvalues at each of them."""
+    """Number of lowest eigenvalues at each wave vector."""
     map_divisions: int = 24
-    """Of each axis of the zone's map; even, 0 for no map."""
+    """Divisions of each axis of the Brillouin zone's map; even, 0 for no map."""
     corners: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    """Names and phases [π rad] of the path, such as [["Γ", [0, 0]], ["M", [1, 1]]]; none: a tour
-    that suits the lattice and its load."""
+    """Names and phases [π rad] of the path's corners, such as [["Γ", [0, 0]], ["M", [1, 1]]]; by
+    default a path that suits the symmetry of lattice and load."""
 
     def __post_init__(self) -> None:
         _check_loads("dispersion", self.loads)
@@ -218,20 +218,20 @@ class DispersionPlan:
 
 @dataclass(frozen=True)
 class ModesPlan:
-    """Which modes are computed, and which buckled branches are followed."""
+    """Options of the modes to compute and the buckled branches to follow."""
 
     waves: tuple[tuple[float, ...], ...] = ()
-    """Phases [π rad], such as [[1, 1]]; none: those that are critical first."""
+    """Phases of the modes' waves [π rad], such as [[1, 1]]; by default the critical waves."""
     load: float = 0.0
-    """At which the tangent is taken [-]; 0: the critical load, or the largest reached. Modes of
-    another load than the critical one have no branches."""
+    """Load at which the tangent is evaluated [-]; 0: the critical load, or the largest reached.
+    Branches are followed only for modes at the critical load."""
     combinations: tuple[tuple[float, ...], ...] = ()
-    """One row of coefficients for each branch to follow, as many as there are modes, in the order
-    of their waves (critical ones by phases, the largest first); none: all that no symmetry makes
-    equal, ``fem.bloch.degenerate.distinct_combinations``."""
+    """One row for each branch to follow, with one coefficient per mode, in the order of their waves
+    (critical waves by phases, the largest first). By default all combinations that are not
+    equivalent by symmetry, ``fem.bloch.degenerate.distinct_combinations``."""
     branch_loads: tuple[float, ...] = ()
-    """At which states of the branches are kept [-]; none: 1.02, 1.1, 1.25 and 1.5 times the
-    critical load."""
+    """Loads at which states of the branches are stored [-]; by default 1.02, 1.1, 1.25 and 1.5
+    times the critical load."""
 
     def __post_init__(self) -> None:
         _ = self.phases
@@ -242,7 +242,7 @@ class ModesPlan:
 
     @property
     def phases(self) -> tuple[Wave, ...]:
-        """The waves in rad."""
+        """Phases of the waves [rad]."""
         return tuple(options.phases_in_rad(wave) for wave in self.waves)
 
 
@@ -252,7 +252,7 @@ def _check_loads(where: str, loads: Sequence[float]) -> None:
 
 
 class LatticeCase(CaseModel):
-    """An infinite lattice under load, and what is asked about it."""
+    """An infinite lattice under load, with the options of its analysis."""
 
     table = "lattice"
 
@@ -266,7 +266,7 @@ class LatticeCase(CaseModel):
 
     @classmethod
     def read(cls, name: str | Path) -> Self:
-        """Read a case as every other; a lattice's own file is found beside the case's."""
+        """Read a case as for any kind; a lattice's path is relative to the folder of its file."""
         case = super().read(name)
         if not isinstance(case.lattice, FileLattice):
             return case
@@ -274,7 +274,7 @@ class LatticeCase(CaseModel):
         return case.model_copy(update={"lattice": replace(case.lattice, path=file)})
 
     def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values, lattice and material by their kinds."""
+        """The case as plain JSON values; lattice and material have their ``kind``."""
         lattice, material = with_kind(self.lattice, LATTICES), with_kind(self.material, MATERIALS)
         return {**super().plain(), "lattice": lattice, "material": material}
 
@@ -289,7 +289,7 @@ class LatticeCase(CaseModel):
         return self
 
     def run_study(self, table: Path, progress: Progress = silent) -> LatticeModeStudy | None:
-        """Do the study, going on from what the table has; None without [study]."""
+        """Run the study, continuing from the rows in ``table``; None without [study]."""
         plan, lattice = self.study, self.lattice
         if plan is None or not isinstance(lattice, SquareLattice):
             return None

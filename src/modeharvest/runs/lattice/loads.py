@@ -1,4 +1,4 @@
-"""How a lattice is loaded, as a case has it; what the load e stands for, and how to write it."""
+"""Loading of a lattice in a case; the quantity that the load e stands for, and its text."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ class LoadQuantity:
     """The quantity that a load parameter e [-] stands for."""
 
     name: str = "strain"
-    """Either "strain", "stress" or "load factor"."""
+    """Name of the quantity: "strain", "stress" or "load factor"."""
     unit: str = "%"
-    """Of the quantity, "" for a factor."""
+    """Unit of the quantity, "" for a factor."""
     per_load: float = 100.0
-    """The quantity at e = 1, in its unit."""
+    """Value of the quantity at e = 1, in ``unit``."""
 
     @classmethod
     def of(cls, loading: MacroLoading) -> LoadQuantity:
-        """Strain where only F̄ is prescribed but for free sides, stress where only P̄ is.
+        """Strain if only F̄ is prescribed (apart from free sides), stress if only P̄ is.
 
-        Stress is its largest component [MPa], in size. Where both grow it is the factor e itself.
+        Stress is the component largest in magnitude [MPa]. If both grow, it is the factor e itself.
         """
         stress = float(np.abs(loading.dead).max())
         if not stress:
@@ -42,7 +42,7 @@ class LoadQuantity:
 
     @property
     def axis(self) -> str:
-        """A diagram's label."""
+        """Label of the quantity for the axis of a diagram."""
         nominal = "nominal " * (self.name == "strain")
         return f"load: {nominal}{self.name} [{self.unit}]" if self.unit else "load factor e [-]"
 
@@ -56,20 +56,20 @@ _ZERO = ((0.0, 0.0), (0.0, 0.0))
 
 @dataclass(frozen=True)
 class Loading:
-    """How the lattice is loaded; the load e multiplies all rates."""
+    """Loading of the lattice; the load parameter e multiplies all rates."""
 
     kind: Literal["uniaxial", "uniaxial-strain", "equibiaxial", "shear", "prescribed"] = "uniaxial"
     """Compression by the nominal strain e: "uniaxial" (lateral side free), "uniaxial-strain" (no
     lateral strain) or "equibiaxial". "shear": planes y = const slide along x by e. Or "prescribed":
     the rates below."""
     axis: Literal["x", "y"] = "x"
-    """Either "x" or "y", of the first two kinds."""
+    """Direction of compression, "x" or "y", for the first two kinds."""
     gradient: tuple[tuple[Component, Component], tuple[Component, Component]] | None = None
-    """dF̄/de, row by row [-], "free" where the mean stress is prescribed; of "prescribed" only."""
+    """dF̄/de, row by row [-]; "free" where mean stress is prescribed. Kind "prescribed" only."""
     stress: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """dP̄/de [MPa] where the gradient is free; of "prescribed" only."""
+    """dP̄/de, row by row [MPa], where the gradient is free. Kind "prescribed" only."""
     angle: float = 0.0
-    """Of the axes x and y of all of these, counter-clockwise from the lattice's x and y [deg]."""
+    """Angle of the loading's axes x and y, counter-clockwise from the lattice's x and y [deg]."""
 
     def __post_init__(self) -> None:
         if self.kind == "prescribed" and self.gradient is None:
@@ -84,7 +84,7 @@ class Loading:
         self.macro()
 
     def macro(self) -> options.MacroLoading:
-        """What the equilibrium equations need."""
+        """The macroscopic loading of the equilibrium equations, in the lattice's axes."""
         if self.gradient is not None:
             (a, b), (c, d) = self.gradient
             rates = (_rate(a), _rate(b)), (_rate(c), _rate(d))
@@ -100,19 +100,19 @@ class Loading:
 
     @property
     def quantity(self) -> LoadQuantity:
-        """What the load e stands for."""
+        """The quantity that the load e stands for."""
         return LoadQuantity.of(self.macro())
 
     @property
     def name(self) -> str:
-        """In words, for tables and pictures."""
+        """Description of the loading, for tables and figures."""
         words = self.kind.replace("-", " ")
         words += f" along {self.axis}" if self.kind.startswith("uniaxial") else ""
         return words + (f", axes turned by {self.angle:g}°" if self.angle else "")
 
     @property
     def is_isotropic(self) -> bool:
-        """Whether the lattice keeps its rotational symmetry."""
+        """Whether the loaded lattice keeps its rotational symmetry."""
         (a, b), (c, d) = self.macro().gradient
         return a is not None and a == d and b == 0 == c
 

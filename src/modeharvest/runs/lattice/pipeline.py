@@ -1,7 +1,7 @@
-"""The analysis of an infinite lattice in one folder, in stages that can be resumed.
+"""Analysis of an infinite lattice, in stages that can be resumed.
 
-Their files: docs/explanation/bloch.md. ``modeharvest bloch`` is the first two and the report,
-``modeharvest modes`` all of them.
+For the files see docs/explanation/bloch.md. ``modeharvest bloch`` runs the first two stages and the
+report, ``modeharvest modes`` all stages.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.cells import UnitCell
 
 BEYOND = (1.02, 1.1, 1.25, 1.5)
-"""Loads at which states of branches are kept, relative to the critical one."""
+"""Loads at which states of branches are stored, divided by the critical load [-]."""
 
 
 @dataclass(frozen=True)
 class LatticeAnalysis(StagedRun[LatticeCase]):
-    """The stages of a lattice's analysis.
+    """Runs the stages of a lattice's analysis.
 
-    All raise InputError if there is no such lattice or its cell isn't periodic, and
-    MissingDependencyError if dolfinx or gmsh is not there.
+    All raise InputError if no such lattice exists or its cell isn't periodic, and
+    MissingDependencyError if dolfinx or gmsh is not installed.
     """
 
     source: str = "CASE"
     """Name or file of the case, for the report."""
 
     def critical(self) -> CriticalPoint:
-        """Find the first critical load over all wave vectors; leaves ``critical.json``.
+        """Find the first critical load over all wave vectors; writes ``critical.json``.
 
-        There ``history`` has the least stable wave at each load looked at. Raises InputError if
+        Its ``history`` has the least stable wave at each load examined. Raises InputError if
         the lattice is a mechanism.
         """
         path = self.folder / "critical.json"
@@ -70,7 +70,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             return made(CriticalPoint, read_json(path)["point"])
 
     def dispersion(self) -> Dispersion:
-        """Compute the lowest eigenvalues; leaves ``dispersion.h5`` and, as a table, ``.csv``."""
+        """Compute the lowest eigenvalues; writes ``dispersion.h5`` and, as a table, ``.csv``."""
         critical, plan = self.critical(), self.case.dispersion
         path, table = self.folder / "dispersion.h5", self.folder / "dispersion.csv"
 
@@ -89,9 +89,9 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return Dispersion.read(path)
 
     def modes(self) -> tuple[ModeSet | None, tuple[Branch, ...]]:
-        """Find modes and branches; leaves ``modes.h5``, ``.vtu`` and ``.xdmf``, if there are any.
+        """Find modes and branches; writes ``modes.h5``, ``.vtu`` and ``.xdmf`` if there are any.
 
-        Raises InputError if a wave asked for doesn't repeat within a dozen cells, or a load can't
+        Raises InputError if a specified wave doesn't repeat within a dozen cells, or a load can't
         be reached.
         """
         critical = self.critical()
@@ -111,7 +111,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return mode_files.read_modes(path)
 
     def families(self) -> None:
-        """Find the mode families of modes, branches and primary path; leaves ``family_*.json``."""
+        """Find the mode families of modes, branches and primary path; writes ``family_*.json``."""
         self.modes()
         index = self.folder / "families.json"
 
@@ -125,25 +125,25 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         self.do("families", self._keys["families"], work)
 
     def study(self) -> None:
-        """Do the study, if the case has one; leaves ``study.csv``."""
+        """Run the study if the case has one; writes ``study.csv``."""
         if self.case.study is None:
             return
         path, key = self.folder / "study.csv", self._keys["study"]
-        rows = self.folder / f"study-{key[:8]}.csv"  # of this very study, to go on from
+        rows = self.folder / f"study-{key[:8]}.csv"  # unfinished rows of the same study
 
         def work() -> tuple[Path, ...]:
             self.case.run_study(rows, self.progress)
             rows.replace(path)
-            for other in self.folder.glob("study-*.csv"):  # of studies given up
+            for other in self.folder.glob("study-*.csv"):  # of abandoned studies
                 other.unlink()
             return (path,)
 
         self.do("study", key, work)
 
     def report(self) -> dict[str, Any]:
-        """Write all that is finished into ``report.html`` and ``summary.json``; returns the latter.
+        """Write ``report.html`` and ``summary.json``; returns the content of the latter.
 
-        Whatever was computed in this folder for this very case is in it.
+        They contain everything that was computed in this folder for the same case.
         """
         path, page = self.folder / "summary.json", self.folder / "report.html"
         done = {n: key for n, key in self._keys.items() if self.is_finished(n, key)}
@@ -165,7 +165,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return dict(read_json(path))
 
     def bloch(self) -> dict[str, Any]:
-        """Stability against all waves, and dispersion; returns the content of ``summary.json``.
+        """Analyse stability and dispersion for all waves; returns the content of ``summary.json``.
 
         Raises InputError if another process works in the folder.
         """
@@ -174,10 +174,10 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             return self.report()
 
     def all(self) -> dict[str, Any]:
-        """All stages that are not finished; returns the content of ``summary.json``.
+        """Run all unfinished stages; returns the content of ``summary.json``.
 
-        Raises InputError if another process works in the folder, or modes can't be had; what
-        there is is reported before.
+        Raises InputError if another process works in the folder, or if modes can't be computed; in
+        the latter case the other results are reported first.
         """
         with exclusive(self.folder):
             self._search()
@@ -192,21 +192,21 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
     # -- parts --------------------------------------------------------------------------
 
     def _search(self) -> None:
-        """The critical point, and the dispersion if it is wanted."""
+        """Find the critical point, and the dispersion if the case specifies it."""
         if self.case.dispersion.points:
             self.dispersion()
         else:
             self.critical()
 
     def _info(self, critical: CriticalPoint) -> dict[str, Any]:
-        """What a mode's user must know of where it comes from."""
+        """The origin of a mode, as stored with it."""
         content = self.case.plain()
         tables = {name: content[name] for name in ("title", "lattice", "material", "loading")}
         return {**tables, "critical": asdict(critical)}
 
     @cached_property
     def _unit(self) -> UnitCell:
-        """The primitive cell's mesh and lattice vectors."""
+        """Mesh and lattice vectors of the primitive cell."""
         with requiring_dolfinx("infinite lattices need"):
             return self.case.lattice.cell()
 
@@ -219,11 +219,11 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return PeriodicCell(unit, self.case.material)
 
     def _path(self, load: float = 0.0, cell: PeriodicCell | None = None) -> CellPath:
-        """A new primary path, followed up to a load [-] in steps that jump over no state.
+        """A new primary path, followed up to a load [-] in steps that skip no state.
 
-        From the beginning, so that no stage depends on another's steps.
+        It begins at load 0, so that no stage depends on the steps of another one.
         """
-        cell = cell or self._cell  # first: without dolfinx it says what is missing
+        cell = cell or self._cell  # first: raises MissingDependencyError without dolfinx
         from modeharvest.fem.lattice.cell import CellPath
 
         path, step = CellPath(cell, self.case.loading.macro()), self.case.search.largest_step
@@ -233,14 +233,14 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return path
 
     def _why_no_modes(self, critical: CriticalPoint) -> str:
-        """Why there is no wave whose modes could be computed; empty if there is one."""
+        """Reason why no mode can be computed; empty if there is a wave for it."""
         if self.case.modes.waves or critical.waves:
             return ""
         what = "long waves are modes of no finite cell" if critical.found else "no critical point"
         return f"no modes: {what}; name waves in [modes], such as waves = [[1, 1]]"
 
     def _modes(self, critical: CriticalPoint) -> tuple[ModeSet, tuple[Branch, ...]]:
-        """The modes of the plan as real fields, and the branches that start with critical ones.
+        """The specified modes as real fields, and the branches that start from critical modes.
 
         Raises InputError if a wave doesn't repeat within a dozen cells, the load can't be reached,
         or combinations don't have one coefficient for each mode.
@@ -258,7 +258,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return modes, tuple(self._branches(modes))
 
     def _branches(self, modes: ModeSet) -> list[Branch]:
-        """A branch for each combination of modes, on their commensurate cell."""
+        """Follow a branch for each combination of modes, on their commensurate cell."""
         from modeharvest.fem.bloch.degenerate import distinct_combinations
         from modeharvest.fem.bloch.postbuckling import follow
         from modeharvest.fem.lattice.cell import PeriodicCell
@@ -276,7 +276,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
     @cached_property
     def _patterns(self) -> list[PeriodicField]:
-        """All fields in which families are looked for: modes, ends of branches, primary path."""
+        """All fields whose families are determined: modes, ends of branches, primary path."""
         critical, (modes, branches) = self.critical(), self.modes()
         info, found = self._info(critical), []
         if modes is not None:
@@ -292,7 +292,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return [*found, PeriodicField.of_primary(path.cell, state, load, modes, info, quantity)]
 
     def _shown(self, modes: ModeSet) -> list[FoundPattern]:
-        """Branches from the lowest energy up, or else modes; and the primary path."""
+        """Fields to show: branches by ascending energy, or else modes; then the primary path."""
         every, pitch = self._patterns, self.case.lattice.pitch
         branches = sorted((p for p in every[:-1] if p.stable is not None), key=lambda p: p.energy)
         found = [FoundPattern.read(pattern, self.folder) for pattern in branches]
@@ -302,7 +302,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return [*found, FoundPattern.read(every[-1], self.folder)]
 
     def _run(self, done: Collection[str]) -> LatticeRun:
-        """All there is, for the report."""
+        """All finished results, for the report."""
         from modeharvest.fem import dolfinx_api
         from modeharvest.fem.bloch.mesh_error import ligament_notes
 
@@ -324,7 +324,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             branches=branches,
             patterns=self._shown(modes) if modes and "families" in done else (),
             study=self.case.run_study(self.folder / "study.csv", self.progress)
-            if "study" in done else None,  # of which the rows are all there
+            if "study" in done else None,  # whose rows are complete
             notes=[*unit.notes, *ligament_notes(unit), *filter(None, [why_no_modes])],
             exports=results.exports_in(self.folder),
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
@@ -332,7 +332,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
     @cached_property
     def _keys(self) -> dict[str, str]:
-        """By stage, the digest of all that it depends on; a cell's own file included."""
+        """For each stage, the digest of all that it depends on, including a cell's file."""
         case, content = self.case, self.case.plain()
         if isinstance(case.lattice, FileLattice):
             content["lattice"]["content"] = sha256_of(case.lattice.path)
@@ -348,7 +348,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
 
 def _state(path: CellPath, load: float) -> CellState:
-    """The state at a load; a millionth below where that is critical with the cell's own period."""
+    """The state at a load, or a millionth below it if that is critical with the cell's period."""
     state = path.at(load) or path.at((1.0 - 1e-6) * load)
     if state is None:
         raise InputError(f"modes: expected a load that the lattice's path reaches, got {load:.6g}")

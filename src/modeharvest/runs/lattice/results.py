@@ -1,6 +1,6 @@
-"""What the analysis of a lattice found: its result types, and their ``summary.json``.
+"""Result types of the analysis of a lattice, and the content of ``summary.json``.
 
-Keys of the latter: docs/explanation/bloch.md.
+Its keys: docs/explanation/bloch.md.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 DRAWN_AMPLITUDE = 0.16
-"""Largest displacement that modes are drawn with [l]."""
+"""Largest displacement of modes in figures, divided by the unit cell size l [-]."""
 
 
 def combination_name(combination: Sequence[float] | FloatArray) -> str:
-    """Modes and signs, with numbers where their sizes differ: "φ₁ + φ₂" or "0.8 φ₁ − 0.6 φ₂"."""
+    """Text of a combination of modes: "φ₁ + φ₂", or "0.8 φ₁ − 0.6 φ₂" if magnitudes differ."""
     parts = [(k, c) for k, c in enumerate(combination, start=1) if abs(c) > 1e-6]
     alike = np.ptp([abs(c) for _, c in parts] or [0.0]) < 1e-6
     text = ""
@@ -54,35 +54,35 @@ def combination_name(combination: Sequence[float] | FloatArray) -> str:
 
 @dataclass(frozen=True)
 class CriticalPoint:
-    """Where a lattice first becomes unstable: what ``LatticeCritical`` says, in plain values."""
+    """First instability of a lattice: the content of ``LatticeCritical`` as plain values."""
 
     loading: str
     load: float
-    """The critical one [-]; the largest at which the lattice was found stable where nothing is
-    critical."""
+    """Critical load [-]; if no critical point was found, the largest load at which the lattice was
+    found stable."""
     found: bool
     outcome: str
     waves: tuple[Wave, ...] = ()
     below: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
     earlier: tuple[Wave, ...] = ()
-    """Waves of the grid that are unstable already below."""
+    """Waves of the grid that are unstable already below the critical load."""
     value: float = 0.0
     """Lowest filling · λ / k² at ``load`` [MPa]."""
     angle: float | None = None
-    """Direction of long waves [rad], None for others."""
+    """Direction of the wave vector of long waves [rad]; None for other waves."""
     splitting: float = 0.0
     splitting_bound: float = 0.0
-    """By how much the mesh splits a degenerate set: ``LatticeCritical`` [-]."""
+    """Splitting of a degenerate set by the mesh, and its bound [-]: ``LatticeCritical``."""
     error: float | None = None
     order: float | None = None
-    """What the mesh makes the load too high by, about, and the order of convergence assumed [-]."""
+    """Estimated excess of the load due to the mesh, and the order of convergence assumed [-]."""
 
     @classmethod
     def of(
         cls, loading: str, found: LatticeCritical, error: tuple[float, float] | None = None
     ) -> CriticalPoint:
-        """A search's result, waves by phases, the largest first: rounding must not number them."""
+        """From a search's result; waves sorted by rounded phases, largest first."""
         every = zip(found.waves, found.below, found.above, strict=True)
         ordered = sorted(every, key=lambda one: [-round(phase, 3) for phase in one[0]])
         waves, below, above = zip(*ordered, strict=True) if ordered else ((), (), ())
@@ -94,29 +94,29 @@ class CriticalPoint:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PeriodicField:
-    """A periodic field of a lattice, in which a mode family is looked for."""
+    """A periodic field of a lattice, whose mode family is to be determined."""
 
     file: str
     """Name of the family's file, such as "family_mode_1.json"."""
     name: str
-    """What it is, such as "φ₁ at 8.8 %"."""
+    """Name of the field, such as "φ₁ at 8.8 %"."""
     mesh: Mesh
     lattice: FloatArray
-    """One period [mm], with its (2, 2) lattice vectors as rows [mm]."""
+    """Mesh of one period [mm], and its (2, 2) lattice vectors as rows [mm]."""
     displacement: FloatArray
     gradient: FloatArray
-    """(n, 2) of the nodes, [-] for modes, [mm] otherwise; its affine part has this F̄ (2, 2)."""
+    """(n, 2) displacement of nodes, [-] for modes, else [mm]; F̄ (2, 2) of its affine part."""
     info: Mapping[str, Any]
-    """Load and whatever else must be known of it, as plain JSON values."""
+    """Load and other information on the field's origin, as plain JSON values."""
     stable: bool | None = None
-    """Whether it is an equilibrium that is stable for fields with the period of its cell; None for
-    a mode, which is no equilibrium."""
+    """Whether the equilibrium is stable for fields with the period of its cell; None for a mode,
+    which is no equilibrium."""
     energy: float = 0.0
-    """Beyond that of the unbuckled lattice, per area [MPa]; 0 for all but branches."""
+    """Energy per area minus that of the unbuckled lattice [MPa]; 0 except for branches."""
 
     @classmethod
     def of_mode(cls, modes: ModeSet, k: int, info: Mapping[str, Any]) -> PeriodicField:
-        """Mode k (from 0) of a set."""
+        """Field of mode k (from 0) of a set."""
         return cls(
             file=f"family_mode_{k + 1}.json",
             name=f"mode {combination_name(np.eye(len(modes.waves))[k])}",
@@ -132,7 +132,7 @@ class PeriodicField:
         cls, modes: ModeSet, k: int, branch: Branch, info: Mapping[str, Any],
         load: LoadQuantity = STRAIN,
     ) -> PeriodicField:  # fmt: skip
-        """The last state of branch k (from 1)."""
+        """Displacement in the last state of branch k (from 1)."""
         last = branch.states[-1]
         return cls(
             file=f"family_branch_{k}.json",
@@ -156,7 +156,7 @@ class PeriodicField:
         info: Mapping[str, Any],
         quantity: LoadQuantity = STRAIN,
     ) -> PeriodicField:
-        """The unbuckled lattice at a load, on the modes' cell where there is one."""
+        """The unbuckled lattice at a load, on the modes' cell if there is one."""
         unit, gradient = cell.cell, state.gradient - np.eye(2)
         mesh, lattice = (unit.mesh, unit.lattice) if modes is None else (modes.mesh, modes.lattice)
         w = cell.displacement(state) - unit.mesh.nodes @ gradient.T
@@ -180,13 +180,13 @@ class PeriodicField:
         return np.asarray(self.displacement - affine)
 
     def scaled(self, largest: float) -> PeriodicField:
-        """A mode with this largest displacement [mm]."""
+        """The mode, scaled to this largest displacement [mm]."""
         shape = self.displacement
         u = largest / float(np.linalg.norm(shape, axis=1).max()) * shape
         return replace(self, displacement=u)
 
     def analysed(self, pitch: float) -> FoundPattern:
-        """The same with its spectrum and family; ``pitch``: unit cell size l [mm]."""
+        """The field with its spectrum and family; ``pitch``: unit cell size l [mm]."""
         place = (self.mesh, self.lattice, self.fluctuation, pitch)
         family = mode_family(*place, info={**self.info, "of": self.name})
         return FoundPattern(**vars(self), spectrum=lattice_spectrum(*place), family=family)
@@ -201,7 +201,7 @@ class FoundPattern(PeriodicField):
 
     @classmethod
     def read(cls, pattern: PeriodicField, folder: Path) -> FoundPattern:
-        """A pattern with what its file in a folder has; InputError if that lacks something."""
+        """A field with spectrum and family of its file in a folder; InputError if incomplete."""
         path = folder / pattern.file
         family, spectrum = read_family(path), read_spectrum(path)
         if spectrum is None:
@@ -210,38 +210,38 @@ class FoundPattern(PeriodicField):
 
 
 def _in_cell(nodes: FloatArray, lattice: FloatArray) -> FloatArray:
-    """(n, 2) fractional coordinates in [0, 1)."""
+    """(n, 2) fractional coordinates in [0, 1) of nodes in the cell of a lattice."""
     fractional = np.mod(nodes @ np.linalg.inv(lattice), 1.0)
-    return np.asarray(np.mod(fractional, 1.0))  # -1e-17 has become 1
+    return np.asarray(np.mod(fractional, 1.0))  # the modulo of -1e-17 is 1
 
 
 @dataclass(frozen=True, eq=False)
 class LatticeRun:
-    """All that the report of a lattice shows; what is None or empty is left out."""
+    """Data of the report of a lattice; parts that are None or empty are omitted."""
 
     title: str
     case: Mapping[str, Any]
-    """What was run, as plain values."""
+    """The case, as plain values."""
     command: str
-    """What makes this page again."""
+    """The command that reproduces the report."""
     mesh: Mesh
     lattice: FloatArray
-    """The primitive cell [mm] and its (2, 2) lattice vectors as rows [mm]."""
+    """Mesh of the primitive cell [mm] and its (2, 2) lattice vectors as rows [mm]."""
     pitch: float
     """Unit cell size l [mm]."""
     load: LoadQuantity = STRAIN
-    """What the load parameter stands for."""
+    """The quantity that the load parameter stands for."""
     critical: CriticalPoint | None = None
     dispersion: Dispersion | None = None
     modes: ModeSet | None = None
     branches: Sequence[Branch] = ()
     patterns: Sequence[FoundPattern] = ()
-    """On the cell of ``modes``; the first is shown at the top."""
+    """Fields on the cell of ``modes``; the first one is shown at the top."""
     study: LatticeModeStudy | None = None
     exports: Mapping[str, str] = field(default_factory=dict)
-    """Files beside the page, and what each holds."""
+    """Files in the folder of the report, with a description of each."""
     notes: Sequence[str] = ()
-    """What a reader should know before trusting the numbers."""
+    """Notes on the reliability of the numbers."""
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -261,7 +261,7 @@ _PEAKS = 8
 
 
 def exports_in(folder: Path) -> dict[str, str]:
-    """Files for further use that are in a folder, and what is in them."""
+    """Files for further use that exist in a folder, with a description of each."""
     known = {name: text for name, text in _EXPORTS.items() if (folder / name).is_file()}
     index = folder / "families.json"
     families = read_json(index) if index.is_file() else {}
@@ -336,7 +336,7 @@ def _eigenvalues(found: Dispersion | None) -> dict[str, Any]:
 
 
 def write_dispersion_table(found: Dispersion, path: Path | str) -> None:
-    """Write the path as a table for own plots: a row for each load and wave vector."""
+    """Write the path as a CSV table for plotting: one row for each load and wave vector."""
     at = dict(zip(found.stops, found.labels, strict=True))
     bands = [f"eigenvalue_{k + 1}_N_per_mm4" for k in range(found.bands)]
     head = ["load", "corner", "phase_1_rad", "phase_2_rad", "distance_rad_per_mm", *bands]

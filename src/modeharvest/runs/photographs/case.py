@@ -1,7 +1,7 @@
 """Photographs of a test as a case: everything a harvest needs, read from a TOML file.
 
-Only files, scale and cell size must be there. Paths are relative to the TOML file. The shipped
-``cases/photographs.toml`` has every table and key, commented.
+Only files, scale and cell size are required. Paths are relative to the TOML file. The shipped
+``cases/photographs.toml`` contains every table and key, with comments.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ LOCAL = ("none", "pyvale", "file")
 
 @dataclass(frozen=True)
 class LocalTable:
-    """The local DIC that spectra and w are taken from."""
+    """The local DIC from whose fields spectra and w are computed."""
 
     code: str = "none"
     """Either "none", "pyvale" (an optional package), or "file" for fields of any other code."""
     files: tuple[str, ...] = ()
-    """With code = "file": a field for each deformed image, or one file of Ncorr with all."""
+    """With code = "file": one field file for each deformed image, or one Ncorr file with all."""
     unit: str = "auto"
     y_axis: str = "auto"
-    """Of the files, "px" or "mm", and "down" or "up"; "auto" as they themselves say."""
+    """Unit of the files ("px", "mm") and their y axis ("down", "up"); "auto": as they state it."""
     first_pixel: int | None = None
-    """What the files call the first pixel, 0 or 1; None as their code does."""
+    """Number of the first pixel in the files, 0 or 1; None for the convention of their code."""
     columns: dict[str, str | int] = field(default_factory=dict)
     """Names, or numbers from 1, of the files' columns for "x", "y", "u" and "v", where they can't
-    be known by themselves."""
+    be recognised automatically."""
     subset: int = 21
     step: int = 5
-    """Edge of the subsets, odd, and their distance [px], with code = "pyvale"."""
+    """Edge length of the subsets (odd) and their spacing [px], with code = "pyvale"."""
 
     def __post_init__(self) -> None:
         if self.code not in LOCAL:
@@ -62,15 +62,15 @@ class LocalTable:
                 f"{self.unit!r} and {self.y_axis!r}"
             )
         require_within("local: expected a first_pixel", self.first_pixel or 0, 0, 1)
-        SubsetOptions(self.subset, self.step)  # checks them
+        SubsetOptions(self.subset, self.step)  # validates both
 
 
 @dataclass(frozen=True)
 class ContourTable:
-    """Contours of a speckled specimen as a second measurement of its modes."""
+    """Contours of a speckled specimen, as a second measurement of its modes."""
 
     measure: bool = False
-    """Whether they are measured, too."""
+    """Whether modes are also measured by contours."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class NoiseTable:
     """The camera's noise."""
 
     sd: float | None = None
-    """Standard deviation [grey levels of the files]; measured from the repeated exposures
-    otherwise, or estimated from the reference image."""
+    """Standard deviation [grey levels of the files]; if not given, it is measured from the repeated
+    exposures or, without these, estimated from the reference image."""
 
     def __post_init__(self) -> None:
         if self.sd is not None:
@@ -91,12 +91,12 @@ class Images(FrameChoice):
     """The photographs."""
 
     reference: str = ""
-    """A file; or a video's first frame, and with test.mp4#12 that one."""
+    """Undeformed state: an image file, a video (its first frame), or test.mp4#12 (frame 12)."""
     deformed: tuple[str, ...] = ()
     """Files of the deformed states in the order of the test, folders or videos; a name may have
-    wildcards, whose matches come in the order of the numbers in their names."""
+    wildcards, whose matches are sorted by the numbers in their names."""
     repeats: tuple[str, ...] = ()
-    """Further exposures of the undeformed state, from which the noise is measured."""
+    """Further exposures of the undeformed state, from which the camera noise is measured."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -109,14 +109,14 @@ class Images(FrameChoice):
 
 @dataclass(frozen=True)
 class ImageScale:
-    """How large a pixel is: its size, or a line in the reference and its length."""
+    """Scale of the images: the pixel size, or a line in the reference and its length."""
 
     pixel_size: float | None = None
-    """[mm/px]."""
+    """Size of a pixel [mm/px]."""
     line: Corners | None = None
-    """Its two ends ((column, row), (column, row)) [px]."""
+    """The two ends of the line in the reference, ((column, row), (column, row)) [px]."""
     length: float | None = None
-    """Of the line [mm]."""
+    """Length of the line [mm]."""
 
     def __post_init__(self) -> None:
         drawn = self.line is not None and self.length is not None
@@ -141,15 +141,15 @@ class ImageScale:
 
 @dataclass(frozen=True)
 class DistortionTable:
-    """The optics' distortion S of the paper's Eq. (r2); none by default."""
+    """The lens distortion S of the paper's Eq. (r2); none by default."""
 
     file: str = ""
-    """A distortion written by modeharvest (JSON)."""
+    """File of a distortion written by modeharvest (JSON)."""
     calibration: tuple[str, ...] = ()
-    """Images of a speckle target under rigid shifts of the stage; the first is the one that the
-    others are shifted from. Names may have wildcards."""
+    """Images of a speckle target under rigid shifts of the stage; the shifts of the others are
+    relative to the first. Names may have wildcards."""
     shifts: Corners = ()
-    """Their shifts (along columns, along rows) [px], if known, the first (0, 0) included."""
+    """Shifts of the target images (along columns, along rows) [px], if known; first (0, 0)."""
 
     def __post_init__(self) -> None:
         if self.file and self.calibration:
@@ -159,7 +159,7 @@ class DistortionTable:
 
 
 class PhotographCase(CaseModel):
-    """Photographs of a test, and what is known of it."""
+    """Photographs of a test, and the known data of the test."""
 
     table = "images"
 
@@ -186,16 +186,16 @@ class PhotographCase(CaseModel):
 
     @property
     def base(self) -> Path:
-        """The folder that files' names are relative to."""
+        """The folder to which file names are relative."""
         return self._base
 
     @property
     def sequence(self) -> ChosenFrames | None:
-        """How its photographs were found and chosen; None before that."""
+        """The chosen photographs and how they were found; None if not yet chosen."""
         return self._sequence
 
     def of_frames(self, sequence: ChosenFrames) -> Self:
-        """The same case, its photographs those that were chosen; :meth:`plain` is as it was."""
+        """The same case with the chosen photographs; :meth:`plain` returns the same as before."""
         reference, *deformed = (str(p.absolute()) for p in (sequence.reference, *sequence.deformed))
         names = tuple(map(glob.escape, deformed))
         images = replace(self.images, reference=reference, deformed=names)
@@ -204,13 +204,13 @@ class PhotographCase(CaseModel):
         return case
 
     def plain(self) -> dict[str, Any]:
-        """The case as plain JSON values, with the photographs' names as they were written."""
+        """The case as plain JSON values, with the photographs' names as in the TOML file."""
         plain = super().plain()
         return plain if self._written is None else plain | {"images": to_plain(self._written)}
 
     @classmethod
     def read(cls, name: str | Path) -> Self:
-        """Read a case as every other; the files it names are found beside its own."""
+        """Read a case like any other; its file names are relative to the folder of its file."""
         case = super().read(name)
         case._base = Path(name).parent
         return case

@@ -1,7 +1,7 @@
 """A testing machine's log: its columns recognised, and joined to photographs by time.
 
-Text with one row a moment: separated by ``;``, ``,``, tabs or blanks; decimal points or commas;
-lines of any text before the heads, units in the heads or in a line below them.
+A log is text with one row per moment, separated by ``;``, ``,``, tabs or blanks, with decimal
+points or commas. Any lines may precede the heads; units are in the heads or in a line below them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NAMES = {
     r"traversenweg|d[eé]placement|desplazamiento|corsa|^disp$|^s$|^x$|compression)",
     "date": r"^(date|datum|fecha|data)$",
 }
-"""Heads of columns without their units, lower case."""
+"""Recognised heads of columns, in lower case and without units."""
 _UNITS = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0, "": 1.0},
     "force": {"n": 1.0, "kn": 1e3, "mn": 1e-3, "cn": 1e-2, "lbf": 4.4482216, "gf": 9.80665e-3,
@@ -35,30 +35,30 @@ _UNITS = {
     "crosshead": {"mm": 1.0, "µm": 1e-3, "um": 1e-3, "μm": 1e-3, "cm": 10.0, "m": 1e3, "in": 25.4,
                   "\"": 25.4, "": 1.0},
 }  # fmt: skip
-"""What one of them is in s, N and mm. "MN" would be read as millinewtons: no laboratory has it."""
+"""Units in s, N or mm. "MN" would be read as millinewtons, but no laboratory uses meganewtons."""
 _HEAD = re.compile(
     r"^(.*?)[\s_]*(?:[\[(<]\s*([^\])>]*)\s*[\])>]|/\s*([a-zA-Zµμ]+)|\bin ([a-z]+))?$"
 )
 _EPOCH = 1e8
-"""Seconds from which on a number is a date, since 1970."""
+"""Numbers from this on are dates, in seconds since 1970 [s]."""
 _ZONE = 900.0
 """Time zones differ by multiples of this [s]."""
 
 
 @dataclass(frozen=True)
 class LogTable:
-    """Table ``[log]``: what the testing machine wrote down."""
+    """Table ``[log]``: the log of the testing machine."""
 
     file: str = ""
-    """Text file, relative to the TOML file; none if empty."""
+    """Text file of the log, relative to the TOML file; no log if empty."""
     time: str = ""
     force: str = ""
     crosshead: str = ""
-    """Heads of the columns, where they aren't recognised."""
+    """Heads of the columns, if they aren't recognised automatically."""
     offset_s: float | None = None
-    """What the log's clock shows minus the camera's [s]; found where it is a time zone."""
+    """Time of the log's clock minus that of the camera [s]; found if they differ by a time zone."""
     length: float | None = None
-    """Of what the crosshead compresses [mm], for nominal strains by it."""
+    """Length that the crosshead compresses [mm], to compute nominal strains from its position."""
 
     def __post_init__(self) -> None:
         others = (self.time, self.force, self.crosshead, self.offset_s, self.length)
@@ -70,24 +70,24 @@ class LogTable:
 
 @dataclass(frozen=True, eq=False)
 class MachineLog:
-    """What a testing machine wrote down."""
+    """The recorded data of a testing machine."""
 
     time: FloatArray
-    """(n,) ascending [s], since 1970 or since it began."""
+    """(n,) times [s], ascending, since 1970 or since the log began."""
     force: FloatArray | None
-    """(n,) [N]."""
+    """(n,) forces [N]; None if not recorded."""
     crosshead: FloatArray | None
-    """(n,) [mm]."""
+    """(n,) crosshead positions [mm]; None if not recorded."""
     text: tuple[str, ...]
-    """How it was read."""
+    """How the log was read, as text for the report."""
 
     @property
     def is_dated(self) -> bool:
-        """Whether its times are of a calendar."""
+        """Whether its times are dates."""
         return bool(self.time[0] > _EPOCH)
 
     def at(self, times: FloatArray) -> dict[str, FloatArray]:
-        """Force [N] and crosshead [mm] at times (k,) by the log's clock; NaN beyond its ends."""
+        """Force [N] and crosshead [mm] at times (k,) [s] of the log's clock; NaN outside it."""
         reach = float(np.median(np.diff(self.time)))
         outside = (times < self.time[0] - reach) | (times > self.time[-1] + reach)
         columns = {"force_N": self.force, "crosshead_mm": self.crosshead}
@@ -98,7 +98,7 @@ class MachineLog:
 
 
 def read_log(path: Path, table: LogTable) -> MachineLog:
-    """Read a log; raises InputError if there is no column of time, or none of force or position."""
+    """Read a log; InputError if it has no column of time, or neither force nor crosshead."""
     with reading(path, "a testing machine's log", "export it as text with a line of heads"):
         above, body, decimal = _rows(_text(path))
         heads, units = _heads(above, len(body[0]))
@@ -143,8 +143,8 @@ def offset_between(
 ) -> tuple[float, tuple[str, ...]]:
     """What to add to the photographs' times (n,) [s] to get the log's, and how it was found.
 
-    Given; else none if both have dates and overlap; else the time zone by which they do; else the
-    log begins with the first photograph.
+    The given offset, if any; else 0 if both have dates and overlap; else the time zone with which
+    they overlap; else the log is taken to begin with the first photograph.
     """
     if given is not None:
         return given, (f"The log's clock is {given:+g} s ahead of the photographs', as given.",)
@@ -159,7 +159,7 @@ def offset_between(
     zones = _ZONE * np.array(sorted(range(-56, 57), key=abs))
     first, last = log.time[[0, -1]] + (-1.0, 1.0)
     shares = [np.mean((times + zone >= first) & (times + zone <= last)) for zone in zones]
-    zone = float(zones[int(np.argmax(shares))])  # the smallest of those that are as good
+    zone = float(zones[int(np.argmax(shares))])  # the smallest of equally good ones
     if not max(shares):
         return 0.0, ("No photograph was taken while the log was written; give offset_s in [log].",)
     text = (
@@ -183,9 +183,9 @@ def _text(path: Path) -> str:
 
 
 def _rows(text: str) -> tuple[list[list[str]], list[list[str]], str]:
-    """Lines above the numbers; those with numbers, all as long; the sign for decimals.
+    """Lines above the numbers; rows with numbers, all of one length; the decimal sign.
 
-    Of all ways to read a text, the one by which most lines are numbers.
+    Of all separators and decimal signs, those with which most lines are numeric are used.
     """
     lines = [line for line in text.splitlines() if line.strip()]
     best: tuple[list[list[str]], list[bool], str] = ([], [], ".")
@@ -205,7 +205,7 @@ def _rows(text: str) -> tuple[list[list[str]], list[list[str]], str]:
 
 
 def _is_numeric(row: Sequence[str], decimal: str) -> bool:
-    """Whether one of the cells is a number, and no other is text but a date or a clock's."""
+    """Whether a row has a number, and no text but dates and times."""
     cells = [cell for cell in row if cell]
     numbers = [np.isfinite(_number(cell, decimal)) for cell in cells]
     return any(numbers) and all(
@@ -215,7 +215,7 @@ def _is_numeric(row: Sequence[str], decimal: str) -> bool:
 
 
 def _number(cell: str, decimal: str) -> float:
-    """A number, with or without a sign for thousands; NaN for what is none."""
+    """The number in a cell, with or without thousands separators; NaN if it is none."""
     other = "," if decimal == "." else "."
     text = cell.replace("\u202f", "").replace("'", "").replace("−", "-")
     if decimal in text and text.find(other) < text.find(decimal):
@@ -260,13 +260,13 @@ def _column(role: str, heads: Sequence[str], given: str, path: Path) -> int | No
 
 
 def _times(stamps: Sequence[str], decimal: str, scale: float) -> FloatArray:
-    """(n,) [s] since 1970, or since the log or the day began; NaN where a row has none."""
+    """(n,) times [s] since 1970, or since the log or the day began; NaN for rows without one."""
     import pandas as pd
 
     numbers = np.array([_number(stamp, decimal) for stamp in stamps])
     if np.isfinite(numbers).mean() > 0.5:
         return np.asarray(scale * numbers)
-    # Clocks on the wall: of a zone that is written beside them nothing is taken.
+    # Times are local: a time zone that is written with them is ignored.
     plain = [re.sub(r"(:\d\d),", r"\1.", re.sub(r"(Z|[+-]\d\d:?\d\d)$", "", s)) for s in stamps]
     times = pd.to_timedelta(pd.Series(plain), errors="coerce").dt.total_seconds()
     if times.isna().mean() > 0.5:

@@ -2,17 +2,17 @@
 
 ::
 
-    distortion.json  calibration.json   optics      S, if it is calibrated, and how
-    prepared/                           prepare     photographs without distortion, masks
-    results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
-    results/NAME_start.json                         where it started from, in words
-    results/NAME_holes.csv  NAME_dots.csv           shapes of holes, where there is no speckle
-    whole_field/NAME.h5  NAME.vtu                   whole displacements, where they are asked for
-    whole_field/NAME_refit.json                     the ansatz of the result, refitted to it
-    contours/NAME.json                  contours    the same by contours beside speckle, if wanted
-    gauges.csv  gauges_along.csv                    what gauges read, if any are named
-    report.html  summary.json           report      everything that was found
-    stages.json timings.json                        which stages are finished, what they took
+    distortion.json  calibration.json   optics      distortion S, if calibrated, and how
+    prepared/                           prepare     undistorted photographs, masks
+    results/NAME.json  NAME.npz         correlate   result, and the field it started from
+    results/NAME_start.json                         description of the initial guess
+    results/NAME_holes.csv  NAME_dots.csv           shapes of holes, if there is no speckle
+    whole_field/NAME.h5  NAME.vtu                   whole displacements, if requested
+    whole_field/NAME_refit.json                     the result's ansatz, refitted to them
+    contours/NAME.json                  contours    results by contours beside speckle, if requested
+    gauges.csv  gauges_along.csv                    readings of the gauges, if any
+    report.html  summary.json           report      all results
+    stages.json timings.json                        finished stages, and their durations
 """
 
 from __future__ import annotations
@@ -92,11 +92,11 @@ from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import find_buckling, mean_strain
 
 _EDGE_PX = 2
-"""A camera's pixels on an edge show some background, and taking out distortion mixes it further."""
+"""A camera's pixels on an edge show some background, which removing distortion mixes further."""
 _ALONG = 120
-"""Points of the error bars along the longer side: they are as smooth as the ansatz."""
+"""Number of points of error bars along the longer side; they are as smooth as the ansatz."""
 _BOTH = "", "_speckle"
-"""Ends of the names of what contours show, and of what speckle shows there."""
+"""Suffixes of the file names of results by contours, and by speckle for comparison."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +104,11 @@ class HarvestRun(StagedRun[PhotographCase]):
     """The stages of a harvest."""
 
     source: str = "EXPERIMENT.toml"
-    """The case's file, for the report."""
+    """Path of the case's TOML file, for the report."""
 
     @cached_property
     def optics(self) -> Optics:
-        """The lens; a calibration leaves ``distortion.json`` and ``calibration.json``."""
+        """The lens; calibrating it writes ``distortion.json`` and ``calibration.json``."""
         table, base = self.case.distortion, self.case.base
         if table.file:
             return Optics(read_distortion(base / table.file))
@@ -126,7 +126,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     @cached_property
     def prepared(self) -> PreparedPhotographs:
-        """Make the photographs ready; leaves ``prepared/``."""
+        """Prepare the photographs for correlation; writes ``prepared/``."""
         folder = self.folder / "prepared"
 
         def work() -> tuple[Path, ...]:
@@ -138,18 +138,18 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     @cached_property
     def geometry(self) -> Geometry:
-        """Holes, lattice and cellular part, from the reference."""
+        """Holes, lattice and cellular part of the specimen, found in the reference."""
         prepared, table = self.prepared, self.case.specimen
         mask = prepared.mask()
-        if self._plain and self._plain.is_part:  # within a cell of there nothing is measured
+        if self._plain and self._plain.is_part:  # leave out a cell's width at the cuts
             mask = away_from_cuts(mask, prepared.grid, table.cell_size)
         return find_geometry(mask, prepared.grid, table, self.case.base)
 
     def results(self) -> Mapping[str, MeasuredPhotograph]:
-        """Correlate every photograph, each after the one before; leaves ``results/``.
+        """Correlate every photograph, each starting from the one before; writes ``results/``.
 
-        One that can't be measured is left out (see :meth:`failures`), and the next goes on from
-        the last that could. Raises InputError if none can be measured.
+        A photograph that can't be measured is left out (see :meth:`failures`), and the next starts
+        from the last one measured. Raises InputError if none can be measured.
         """
         found, failed = self._correlated
         if not found:
@@ -159,7 +159,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     @cached_property
     def _keys(self) -> dict[str, str]:
-        """Of the stages that correlate, each depending on those before it."""
+        """Keys of the correlation stages by photograph, each including those before it."""
         how, local, keys = self.case.plain(), self.case.local.files, {}
         whole = how["whole_field"] if self.case.whole_field.measure else None
         key = digest([self._prepared_key(), [how["correlation"], how["local"], whole]])
@@ -174,7 +174,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         return tuple(self._correlated[1].items())
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
-        """All that is known of the test, for the report."""
+        """All results of the test, for the report; ``truth``: if they are from a simulation."""
         case, prepared, region = self.case, self.prepared, self.geometry.region
         results, source = self.results(), Path(self.source)
         known = Harvest(
@@ -192,7 +192,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             frame = self._frame(name, results[name])
             moments.append(amplitude_of(frame, region.cellular))
             numbers.append(frame_numbers(replace(known, timeline=moments[-1:]), frame))
-            if len(results) <= MOST_SHOWN:  # of more, not all have room in the memory at once
+            if len(results) <= MOST_SHOWN:  # more might not fit into memory
                 kept[name] = frame
         shown = [moments[k].name for k in shown_moments(moments)]
         frames = (kept.get(name) or self._frame(name, results[name]) for name in shown)
@@ -205,10 +205,10 @@ class HarvestRun(StagedRun[PhotographCase]):
         )
 
     def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
-        """Do everything that is not finished; returns the content of ``summary.json``.
+        """Run every stage that is not finished; returns the content of ``summary.json``.
 
-        Raises InputError if another process works in the folder, it can't be written to, or no
-        photograph can be measured.
+        Raises InputError if another process works in the folder, the folder can't be written to, or
+        no photograph can be measured.
         """
         with exclusive(self.folder):
             require_writable(self.folder)
@@ -226,14 +226,14 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     @cached_property
     def _correlated(self) -> tuple[Mapping[str, MeasuredPhotograph], dict[str, str]]:
-        """Photographs that were measured, and why others could not be."""
-        _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
+        """Measured photographs by name, and for each failed one the reason."""
+        _ = self.geometry  # so that errors of the reference aren't reported for an image
         if self.case.gauges and self._plain is None and not self.case.whole_field.measure:
             raise InputError(
                 "gauges: expected whole displacements, which they read, got none: give "
                 "--whole-field, or set measure = true in [whole_field]"
             )
-        for gauge in self.case.gauges:  # one beside the material is known before anything else
+        for gauge in self.case.gauges:  # InputError first, if one is beside the material
             points_of(gauge, self.geometry.grid, self._mesh[0].mesh)
 
         def work(
@@ -262,7 +262,7 @@ class HarvestRun(StagedRun[PhotographCase]):
     def _correlated_pair(
         self, name: str, last: tuple[str, MeasuredPhotograph] | None
     ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
-        """A photograph that was correlated, and the files of its whole displacement if wanted."""
+        """Correlate a photograph; with the files of its whole displacement, if requested."""
         case, pair = self.case, self._pair(name, last)
         local = prepare.local_field(case, self.prepared, name, self.optics.distortion)
         measured = measure(
@@ -275,7 +275,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     @cached_property
     def _beside(self) -> tuple[Mapping[str, ByContours], dict[str, str]]:
-        """Modes by contours of speckled photographs, if asked for, and why there are none."""
+        """Modes by contours of speckled photographs, if requested; for failed ones the reason."""
         folder, grid, cell = self.folder / "contours", self.prepared.grid, self.case.specimen
         cell_px = cell.cell_size / grid.pixel_size
         if not self.case.contours.measure or self._plain is not None:
@@ -291,7 +291,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             (edges, body), paths = reference(), [folder / f"{name}{of}.json" for of in _BOTH]
             pair, speckle = self.prepared.pair(name), self.results()[name].result
             found = measure_by_contours(edges, pair, speckle, cell.cell_size, body, self.progress)
-            if edges.is_part:  # w, which the ansatz can't describe, has other fits on other pixels
+            if edges.is_part:  # other pixels give another fit: the ansatz doesn't describe w
                 mask = away_from_cuts(pair.masks[0], grid, cell.cell_size)
                 speckle = self._correlated_again(replace(pair, mask=mask), found.result)
             for path, result in zip(paths, (found.result, speckle), strict=True):
@@ -306,7 +306,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         return self.do_in_turn("contours", keys, folder, work, read)
 
     def _correlated_again(self, pair: ImagePair, known: Result) -> Result:
-        """A result's ansatz on other pixels of the reference, from there on, with errors."""
+        """Correlate a result's ansatz, starting from it, on the pair's pixels; with errors."""
         table = self.case.correlation
         (ansatz, a), how = with_brightness(known, table), table.options()
         how = replace(how, levels=how.levels[-1:])
@@ -315,7 +315,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     @cached_property
     def _plain(self) -> MaterialContours | None:
-        """What the reference shows if the specimen has no speckle."""
+        """The reference's contours if the specimen has no speckle, else None."""
         if not self.prepared.is_plain:
             return None
         if self.case.local.code != "none":
@@ -328,7 +328,7 @@ class HarvestRun(StagedRun[PhotographCase]):
     def _by_contours(
         self, name: str, plain: MaterialContours, before: MeasuredPhotograph | None
     ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
-        """A photograph that was measured by its contours, and the files of that."""
+        """Measure a photograph by its contours; returns the result and its files."""
         case, (body, _) = self.case, self._mesh
         found, contours = measure_contours(
             plain, self.prepared.pair(name), name, self.geometry, case.specimen.cell_size,
@@ -338,7 +338,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         return found, (*shapes, *self._whole_files(name, found))
 
     def _gauges(self) -> list[dict[str, Any]]:
-        """What gauges read in every whole displacement; leaves ``gauges.csv``."""
+        """Readings of the gauges in every whole displacement; writes ``gauges.csv``."""
         if not (wanted := self.case.gauges):
             return []
         found = {name: self._wholes.path(name) for name, m in self.results().items() if m.whole}
@@ -346,7 +346,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         return reading_rows(write_gauges(self.folder, wanted, each, "mm")) if found else []
 
     def _whole_files(self, name: str, found: MeasuredPhotograph) -> tuple[Path, ...]:
-        """Write a whole displacement and the ansatz refitted to it."""
+        """Write a whole displacement and the ansatz refitted to it; returns the files."""
         whole, refit = found.whole, self._paths(name)[-1]
         assert whole
         whole.refit.write(refit)
@@ -354,16 +354,16 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     @cached_property
     def _mesh(self) -> tuple[Body, FiniteElementOptions]:
-        """Of the reference's material, and how to measure on it."""
+        """The mesh of the reference's material, and the options of measuring on it."""
         how = replace(self.case.whole_field.on_mesh(), edge_px=_EDGE_PX)
         return how.body(self.prepared.mask(), self.prepared.grid), how
 
     def _with_whole(
         self, name: str, pair: ImagePair, first: MeasuredPhotograph
     ) -> tuple[MeasuredPhotograph, Sequence[Path]]:
-        """A photograph that was correlated with its whole displacement, and the files of that.
+        """Add the whole displacement to a correlated photograph; returns also its files.
 
-        One that can't be measured so keeps its modes, and has a warning.
+        If it can't be measured, the photograph keeps its modes and gets a warning.
         """
         case = self.case
         try:
@@ -412,19 +412,19 @@ class HarvestRun(StagedRun[PhotographCase]):
         )  # fmt: skip
 
     def _errors(self, name: str, measured: MeasuredPhotograph) -> Covariance:
-        """Of a photograph's unknowns, by its noise and by model error."""
+        """Covariances of a photograph's unknowns, by noise and by model error."""
         result = measured.result
         if self._plain is not None and measured.whole:
             return Covariance(result.covariance(), measured.whole.refit.covariance())
         return self._covariance(result, self.prepared.pair(name))
 
     def _covariance(self, result: Result, pair: ImagePair) -> Covariance:
-        """Of what was correlated."""
+        """Covariances of the unknowns of a correlated pair, by noise and by model error."""
         case, noise = self.case, image_noise(pair, self.prepared.noise)
         return covariance(result, pair, noise, case.specimen.cell_size, case.correlation.edge_px)
 
     def _pair(self, name: str, last: tuple[str, MeasuredPhotograph] | None) -> ImagePair:
-        """The photograph and what it is correlated with."""
+        """The pair to correlate; "updated": with the last photograph, warped back."""
         pair = self.prepared.pair(name)
         if self.case.correlation.formulation != "updated" or last is None:
             return pair
@@ -454,11 +454,11 @@ def harvest(
 ) -> dict[str, Any]:  # fmt: skip
     """Harvest modes from photographs of a test; what ``modeharvest harvest`` does.
 
-    ``case``: the path of its TOML file, or the case itself; ``folder``: where to leave the files;
-    ``whole_field``: whether to measure whole displacements, ``contours``: whether to measure modes
-    by them beside speckle, None for what the case says.
-    Returns the content of ``summary.json``. Raises InputError if the case can't be used; before
-    anything is computed, if a file is missing.
+    ``case``: the path of its TOML file, or the case itself; ``folder``: where files are written;
+    ``whole_field``: whether to measure whole displacements; ``contours``: whether to also measure
+    modes by contours beside speckle; both None for the case's own choice.
+    Returns the content of ``summary.json``. Raises InputError if the case can't be used; if a file
+    is missing, before anything is computed.
     """
     found = PhotographCase.of(case)
     beside = {} if contours is None else {"contours": ContourTable(contours)}
@@ -469,7 +469,7 @@ def harvest(
 
 
 def _axes(domain: Box) -> tuple[FloatArray, FloatArray]:
-    """Positions over the specimen, about as dense both ways [mm]."""
+    """x and y axes over the specimen, about equally dense [mm]."""
     across, up = (max(2, round(_ALONG * half / max(domain.half)) + 1) for half in domain.half)
     return (
         np.linspace(domain.x_min, domain.x_max, across, dtype=np.float64),

@@ -1,7 +1,7 @@
-"""Photographs made ready for correlation: files found, lens, ideal images, masks, local fields.
+"""Prepares photographs for correlation: finds files, lens, ideal images, masks, local fields.
 
-The images are grey levels as the camera counts them, float32, on the ideal pixel grid; the masks
-are white on material. A local DIC's field is another code's file, or pyvale's subsets.
+Images are float32 grey levels in the camera's units, on the ideal (undistorted) pixel grid; masks
+are white on material. A local DIC field comes from a file of another code, or from pyvale.
 """
 
 from __future__ import annotations
@@ -57,21 +57,21 @@ from modeharvest.util.typed import made, picked, to_plain
 PREPARED_FILE = "prepared.json"
 LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 CODE = ("fem", "imaging", "idic", "runs")
-"""What numbers from photographs depend on: libraries, and folders of the package."""
+"""Libraries, and folders of the package, on which results from photographs depend."""
 _PLAIN = "The material has no speckle: it was found by its grey level."
 _ARRAYS = "shifts shifts_sd angles angles_sd matches covariance"
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedPhotographs:
-    """Photographs on the ideal grid, in a folder; read when asked for."""
+    """Photographs on the ideal grid, in a folder; each is read when it is needed."""
 
     folder: Path
-    """Has the files, and the rest in its ``prepared.json``."""
+    """The folder of the image files; the other data are in its ``prepared.json``."""
     names: tuple[str, ...]
-    """Of the deformed images that can be used, in the order of the test."""
+    """Names of the deformed images that can be used, in the order of the test."""
     skipped: tuple[tuple[str, str], ...]
-    """The name of each file that can't be used, and why."""
+    """The name of each file that can't be used, and the reason."""
     noise: CameraNoise
     grid: PixelGrid
     """The ideal pixels; the physical origin is the middle of the image."""
@@ -80,36 +80,36 @@ class PreparedPhotographs:
     notes: tuple[str, ...] = ()
     """What was done to the photographs."""
     warnings: tuple[str, ...] = ()
-    """What makes their errors larger, and what else they show."""
+    """What makes errors larger, and what else the photographs show."""
     is_plain: bool = False
-    """Whether they show no speckle: then their contours are measured."""
+    """Whether the photographs show no speckle; then contours are measured."""
     rigid: Mapping[str, RigidMotion] = field(default_factory=dict)
-    """By their names, how those that were turned as a whole had moved; they are as if they hadn't.
+    """By name: rigid motion of the specimen, where it had turned; removed from the photograph.
     """
 
     @classmethod
     def read(cls, folder: Path) -> PreparedPhotographs:
-        """Open a finished folder; raises InputError if it isn't one."""
+        """Open a finished folder; InputError if it isn't one."""
         path = folder / PREPARED_FILE
         with reading(path, "prepared photographs", "remove it, and harvest again"):
             return made(cls, {**dict(read_json(path)), "folder": folder})
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Every file, the record last."""
+        """Every file; ``prepared.json`` is the last."""
         stems = (f"{name}{kind}" for name in ("reference", *self.names) for kind in ("", "_mask"))
         return (*(self.folder / f"{stem}.tif" for stem in stems), self.folder / PREPARED_FILE)
 
     def image(self, name: str = "reference") -> FloatImage:
-        """(rows, cols) grey levels."""
+        """(rows, cols) image of a photograph [grey levels]."""
         return read_image(self.folder / f"{name}.tif")
 
     def mask(self, name: str = "reference") -> BoolArray:
-        """(rows, cols) True on material."""
+        """(rows, cols) mask of a photograph, True on material."""
         return read_mask(self.folder / f"{name}_mask.tif")
 
     def pair(self, name: str) -> ImagePair:
-        """The reference and a deformed photograph."""
+        """The image pair of the reference and a deformed photograph."""
         return ImagePair(
             self.image(), self.image(name), self.grid, self.mask(), self.mask(name),
             is_plain=self.is_plain,
@@ -119,8 +119,8 @@ class PreparedPhotographs:
 def of_each_photograph(case: PhotographCase, names: Sequence[str], what: str) -> dict[str, Path]:
     """The file that goes with each deformed photograph, by the photograph's name.
 
-    ``names`` of the files, or patterns; none at all is all right, and so is one with a field for
-    each. Raises InputError if there aren't as many as photographs; ``what`` begins the message.
+    ``names``: file names or patterns; may be empty, or one file with a field for each photograph.
+    Raises InputError, whose message begins with ``what``, if their number differs otherwise.
     """
     files = named_files(case.base, names, unique=False)
     photographs = named_files(case.base, case.images.deformed)
@@ -135,7 +135,7 @@ def of_each_photograph(case: PhotographCase, names: Sequence[str], what: str) ->
 
 
 def all_files(case: PhotographCase) -> tuple[Path, ...]:
-    """Every file that a case names, but fields of a local DIC."""
+    """Every file that a case names, except the fields of a local DIC."""
     images, table, lens = case.images, case.specimen, case.distortion
     names = [images.reference, *images.deformed, *images.repeats]
     names += [table.material, table.cells, *table.deformed_material]
@@ -148,7 +148,7 @@ def with_chosen_frames(
 ) -> PhotographCase:
     """A case whose photographs are files: folders, videos and choices among them are resolved.
 
-    ``folder``: of the run, where frames of videos go. InputError if nothing is left to measure.
+    ``folder``: the run's, to which frames of videos are written. InputError if none is chosen.
     """
     images = case.images
     found = chosen_frames(
@@ -158,7 +158,7 @@ def with_chosen_frames(
 
 
 def require_inputs(case: PhotographCase) -> None:
-    """Check that all is there that a case names.
+    """Check that all files and libraries that a case needs are available.
 
     Raises InputError if a file is missing, or there aren't as many masks or fields as photographs;
     MissingDependencyError if pyvale is asked for and not installed.
@@ -182,15 +182,15 @@ class Optics:
     """The lens."""
 
     distortion: Distortion | None = None
-    """S of the paper's Eq. (r2); None for none."""
+    """Distortion S of the paper's Eq. (r2); None for a lens without distortion."""
     calibration: Calibration | None = None
-    """How it was found, if it wasn't given."""
+    """The calibration that gave the distortion; None if the distortion was given."""
 
 
 def calibrate_lens(
     table: DistortionTable, base: Path, folder: Path, progress: Progress = silent
 ) -> None:
-    """Calibrate from the images of a target; leaves ``distortion.json``, ``calibration.json``.
+    """Calibrate from the images of a target; writes ``distortion.json``, ``calibration.json``.
 
     Raises InputError if a file can't be used, or the images don't determine the distortion.
     """
@@ -204,7 +204,7 @@ def calibrate_lens(
 
 
 def calibration_text(found: Calibration) -> tuple[str, ...]:
-    """What was found, and what could not be."""
+    """Text for the report: what the calibration determined, and what it could not."""
     chosen = next(t for t in found.trials if t.bic == 0.0)
     row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
     size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
@@ -220,11 +220,11 @@ def calibration_text(found: Calibration) -> tuple[str, ...]:
 
 
 def calibrated_lens(folder: Path) -> Optics:
-    """What :func:`calibrate_lens` left."""
+    """Read the files that :func:`calibrate_lens` wrote."""
     path = folder / "calibration.json"
     with reading(path, "a calibration", "remove it, and harvest again"):
         distortion, content = read_distortion(folder / "distortion.json"), read_json(path)
-        if not isinstance(distortion, PolynomialDistortion):  # that is what is calibrated
+        if not isinstance(distortion, PolynomialDistortion):  # a calibration gives a polynomial
             raise InputError("expected a polynomial in distortion.json beside it, got another kind")
         fixed = int(content["fixed"])
         arrays: dict[str, Any] = {name: np.array(content[name], float) for name in _ARRAYS.split()}
@@ -243,15 +243,15 @@ def prepare(
     case: PhotographCase, folder: Path, distortion: Distortion | None = None,
     progress: Progress = silent,
 ) -> PreparedPhotographs:  # fmt: skip
-    """Make a case's photographs ready; leaves them in ``folder``.
+    """Prepare a case's photographs for correlation; writes them to ``folder``.
 
-    Raises InputError if the reference can't be used, or none of the deformed images.
+    Raises InputError if the reference, or every deformed image, can't be used.
     """
     images, table, base = case.images, case.specimen, case.base
     window = window_for(cell_px := table.cell_size / case.scale.mm_per_px)
 
     def save(name: str, photograph: Photograph, found: ShownMaterial) -> None:
-        """Write image and mask without distortion."""
+        """Write a photograph's image and mask, with the lens distortion removed."""
         image, mask = photograph.image, found.mask
         if distortion is not None:
             image, mask = undistorted(image, distortion), undistorted_mask(mask, distortion)
@@ -267,7 +267,7 @@ def prepare(
     own = own if table.material else _one_specimen(own, cell_px)
     save("reference", reference, own)
     lattice = None
-    if case.local.code != "file":  # fields of other codes know the motion as it is
+    if case.local.code != "file":  # other codes' fields include the rigid motion
         with suppress(InputError):
             lattice = find_hole_lattice(read_mask(folder / "reference_mask.tif"))
     deformed = named_files(base, images.deformed)
@@ -310,22 +310,22 @@ def prepare(
 
 @dataclass(frozen=True, eq=False)
 class ShownMaterial:
-    """Where a photograph shows material."""
+    """The material that a photograph shows."""
 
     mask: BoolArray
-    """(rows, cols) True there."""
+    """(rows, cols) True on material."""
     text: tuple[str, ...] = ()
-    """How it was found."""
+    """How the material was found, as text for the report."""
     is_plain: bool = False
     """Whether the material has no speckle."""
     warnings: tuple[str, ...] = ()
-    """Whether there are other specimens."""
+    """Says whether the photograph shows other specimens."""
 
 
 def _material(
     photograph: Photograph, given: Path | None, window: int, like: ShownMaterial | None = None
 ) -> ShownMaterial:
-    """The material of a photograph, as given or as found; plain, where the reference's was."""
+    """The material given by a mask, or found; plain material is sought where ``like`` has it."""
     if given is not None:
         mask = read_mask(given)
         require_same_shape(photograph.image, mask, str(photograph.path), str(given))
@@ -339,7 +339,7 @@ def _material(
 
 
 def _require_alike(reference: ShownMaterial, deformed: ShownMaterial, path: Path) -> None:
-    """InputError if one shows speckle and the other one doesn't."""
+    """InputError if only one of the two photographs shows speckle."""
     if reference.is_plain != deformed.is_plain:
         kinds = "a specimen with speckle", "a specimen without speckle"
         raise InputError(
@@ -351,9 +351,9 @@ def _require_alike(reference: ShownMaterial, deformed: ShownMaterial, path: Path
 def _one_specimen(
     shown: ShownMaterial, cell_px: float, like: ShownMaterial | None = None
 ) -> ShownMaterial:
-    """The largest of several specimens in a photograph, or the one where the reference's was.
+    """The largest of several specimens in a photograph, or the one at the place of ``like``.
 
-    What is less than half a cell apart is one.
+    Parts less than half a cell apart belong to one specimen.
     """
     where, of_another = like.mask if like else None, "give a mask of another one as material"
     for apart_px in (0.0, 0.25 * cell_px):  # the first is quick
@@ -364,13 +364,13 @@ def _one_specimen(
 
 
 _LIGHT = 0.03
-"""Relative change of the material's mean or contrast from which on the light has changed."""
+"""Relative change of the material's mean or contrast above which illumination is corrected."""
 
 
 def _lit_as(
     reference: Photograph, mask: BoolArray, frame: Photograph, shown: BoolArray
 ) -> Photograph:
-    """A photograph with the mean and the contrast of the reference's material if its differ."""
+    """A photograph with mean and contrast matched to the reference's material if they differ."""
     f, g = reference.image[mask], frame.image[shown]
     mean, contrast = float(f.mean(dtype=np.float64)), float(f.std(dtype=np.float64))
     gain = contrast / max(float(g.std(dtype=np.float64)), 1e-12)
@@ -386,11 +386,11 @@ def _lit_as(
 
 
 _TURNED_DEG = 0.5
-"""From which on a specimen's rotation is taken out of its photograph: a pattern turns with it."""
+"""Rotation [degrees] above which it is removed from a photograph: the pattern turns with it."""
 
 
 def _turned(lattice: HoleLattice | None, mask: BoolArray) -> RigidMotion | None:
-    """How a specimen has moved as a whole, if it has turned; None, too, where that isn't known."""
+    """Rigid motion of a specimen if it has turned; None if it has not, or this isn't known."""
     with suppress(InputError):
         motion = None if lattice is None else rigid_motion(lattice, find_hole_lattice(mask))
         return motion if motion and abs(motion.angle_deg) > _TURNED_DEG else None
@@ -398,7 +398,7 @@ def _turned(lattice: HoleLattice | None, mask: BoolArray) -> RigidMotion | None:
 
 
 def _noise(case: PhotographCase, reference: Photograph, mask: BoolArray) -> CameraNoise:
-    """Given, measured or estimated, in this order; before any interpolation smooths it."""
+    """Noise as given, else measured, else estimated; before interpolation smooths the images."""
     if case.noise.sd is not None:
         return CameraNoise(case.noise.sd, GIVEN)
     if not case.images.repeats:
@@ -413,7 +413,7 @@ def local_field(
 ) -> LocalField | None:
     """The displacement field of one deformed photograph by a local DIC; None if there is none.
 
-    Files are of the photographs before the lens was taken out of them; it is taken out here.
+    Files must be of the photographs with lens distortion; it is removed from the fields here.
     Raises InputError if there aren't as many files as photographs, or this one's can't be used.
     """
     table, grid = case.local, prepared.grid

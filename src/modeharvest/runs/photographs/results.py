@@ -1,6 +1,6 @@
-"""What was found in photographs of a test: its result types, and their ``summary.json``.
+"""Results from photographs of a test: their types, and their ``summary.json``.
 
-Keys of the latter: docs/how-to/harvest.md.
+The keys of ``summary.json``: docs/how-to/harvest.md.
 """
 
 from __future__ import annotations
@@ -42,28 +42,28 @@ from modeharvest.validation.whole_field import WholeFieldSummary, whole_numbers
 
 @dataclass(frozen=True, eq=False)
 class PartSpectrum:
-    """Spectrum of a part of the displacement, and the pattern read off it."""
+    """Spectrum of a part of the displacement, and the pattern determined from it."""
 
     name: str
-    """Of a region of the specimen that has modes of its own; or "w"."""
+    """Name of a region of the specimen that has separate modes; or "w"."""
     spectrum: Spectrum
-    """Of the displacement in that region, or of w, without its affine part."""
+    """Spectrum of the displacement in that region, or of w, without the affine part."""
     pattern: WavePattern
 
 
 @dataclass(frozen=True, eq=False)
 class HarvestedFrame:
-    """What was found in one deformed photograph."""
+    """The results of one deformed photograph."""
 
     name: str
-    """Differs from all others'."""
+    """Name of the photograph, unique in the test."""
     strain_x: float
     strain_y: float
     """Mean nominal compression of the cellular part [-]."""
     image: FloatImage
     mask: BoolArray | None
-    """(rows, cols) the photograph, free from distortion [grey levels], and True on its material;
-    None if not known. May be memory-mapped."""
+    """(rows, cols) the undistorted photograph [grey levels], and its mask, True on material; the
+    mask is None if not known. May be memory-mapped."""
     result: Result
     identifiability: Identifiability
     residual_test: ResidualTest
@@ -71,36 +71,36 @@ class HarvestedFrame:
     error_y: FloatArray
     """(p,) and (q,) axes [mm] of the error bars."""
     by_noise: FieldErrors
-    """Error bars on these axes by the images' noise, arrays (q, p, ...)."""
+    """Error bars on these axes by image noise, arrays (q, p, ...)."""
     by_model_error: FieldErrors | None = None
-    """Error bars by model error, likewise; None if they can't be had."""
+    """Error bars on these axes by model error; None if not available."""
     spectrum: Spectrum | None = None
-    """Of the displacement without its affine part."""
+    """Spectrum of the displacement without its affine part."""
     pattern: WavePattern | None = None
-    """What is read off the spectrum."""
+    """Wave pattern determined from the spectrum."""
     parts: tuple[PartSpectrum, ...] = ()
-    """In one order for all photographs."""
+    """Spectra of parts, in the same order for all photographs."""
     w: LocalField | None = None
-    """What the ansatz leaves of a local DIC's field, or of the whole displacement's."""
+    """Microfluctuation w: local DIC's field, or the whole displacement, minus the ansatz."""
     whole: WholeField | None = None
     """The whole displacement, if it was measured."""
     contours: ByContours | None = None
-    """The same ansatz by contours beside speckle, if they were measured."""
+    """The same ansatz measured by contours beside speckle, if requested."""
     rigid: RigidMotion | None = None
-    """What was taken out of the photograph before it was measured; None if it was as good as
-    upright."""
+    """Rigid motion removed from the photograph before it was measured; None if the rotation was
+    negligible."""
     start_text: tuple[str, ...] = ()
-    """Where the correlation started from."""
+    """Description of the correlation's initial guess."""
     warnings: tuple[str, ...] = ()
 
     @property
     def by_contours(self) -> bool:
-        """Whether contours were measured, and the ansatz was fitted to the displacement."""
+        """Whether contours were measured, and the ansatz fitted to the displacement from them."""
         return self.whole is not None and self.whole.measured.shown == "contours"
 
     @property
     def modes(self) -> range:
-        """Numbers of the modes, from 0."""
+        """Indices of the modes, from 0."""
         return range(len(self.result.ansatz.modes))
 
 
@@ -109,11 +109,11 @@ class FrameTruth:
     """The truth of one frame, in the reference frame."""
 
     displacement: NDArray[Any]
-    """(rows, cols, 2) [mm], NaN off the material; may be memory-mapped."""
+    """(rows, cols, 2) true displacement [mm], NaN off the material; may be memory-mapped."""
     best: Result
-    """The best fit of the frame's ansatz to it."""
+    """The best fit of the frame's ansatz to the true displacement."""
     whole: WholeFieldSummary | None = None
-    """How far from it the whole displacement is, if that was measured."""
+    """Errors of the whole displacement against the truth, if it was measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,44 +121,44 @@ class HarvestTruth:
     """The truth of photographs that were made by a simulation."""
 
     frames: Mapping[str, FrameTruth]
-    """By their names, some may be missing."""
+    """Truth of the photographs, by name; some may be missing."""
     distortion: Distortion | None = None
     rows: tuple[Expectation, ...] = ()
-    """What was found against what is true."""
+    """Measured values compared with the truth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Harvest:
-    """All that the report of a harvest shows; what is None or empty is left out."""
+    """All data that the report of a harvest shows; None or empty fields are left out."""
 
     case: PhotographCase
     geometry: Geometry
     """The reference's material, holes and cellular part, on the pixels of the ideal images."""
     reference: FloatImage
-    """(rows, cols) the photograph of the undeformed state, free from distortion [grey levels]."""
+    """(rows, cols) the undistorted photograph of the undeformed state [grey levels]."""
     frames: tuple[HarvestedFrame, ...]
-    """In the order of the test; of many only those that :func:`shown_moments` names."""
+    """Photographs in the order of the test; of many, only those of :func:`shown_moments`."""
     noise: CameraNoise
     numbers: Sequence[Mapping[str, Any]] = ()
-    """``frames`` of the summary, of all photographs; by default those of ``frames``."""
+    """``frames`` of the summary for all photographs; if empty, made from ``frames``."""
     skipped: tuple[tuple[str, str], ...] = ()
-    """Names of photographs that were not used, and why."""
+    """Names of photographs that were not used, and the reasons."""
     timeline: Sequence[ImageAmplitude] = ()
-    """In the order of the test."""
+    """Amplitudes of all photographs, in the order of the test."""
     buckling: Buckling | None = None
     optics: Optics = field(default_factory=Optics)
     full_scale: float | None = None
     """Largest grey level of the camera; None if not known."""
     gauges: Sequence[Mapping[str, Any]] = ()
-    """``gauges`` of the summary: what each reads in every photograph."""
+    """``gauges`` of the summary: reading of each gauge in every photograph."""
     warnings: tuple[str, ...] = ()
     """What makes errors larger, and what else the photographs show."""
     text: tuple[str, ...] = ()
-    """What was done to the photographs and found in them, in words."""
+    """Text on how the photographs were processed, and what was found in them."""
     truth: HarvestTruth | None = None
     command: str = "modeharvest harvest EXPERIMENT.toml"
     toml: str = ""
-    """Both make this page again; the case's values are shown if ``toml`` is empty."""
+    """Command and TOML text that reproduce the report; if ``toml`` is empty, it shows the case."""
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -180,14 +180,14 @@ class Harvest:
 def error_fields(
     result: Result, x: FloatArray, y: FloatArray
 ) -> tuple[FieldErrors, FieldErrors | None]:
-    """Error bars of a result on axes [mm], by noise and by model error if that is known."""
+    """Error bars of a result on axes [mm]: by noise, and by model error (None if unknown)."""
     assert result.errors is not None
     noise, model = field_errors(result, x, y, result.errors.by_noise), result.errors.by_model_error
     return noise, None if model is None else field_errors(result, x, y, model)
 
 
 def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
-    """A frame's place on the time line."""
+    """A frame's point on the test's time line."""
     identified, noise = frame.identifiability, rms_errors(frame, frame.by_noise, cellular)
     return ImageAmplitude(
         name=frame.name,
@@ -199,11 +199,11 @@ def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
 
 
 MOST_SHOWN = 6
-"""Photographs with pictures of their own, at most; numbers are given of all."""
+"""Largest number of photographs shown as pictures; numbers are given for all."""
 
 
 def shown_moments(moments: Sequence[ImageAmplitude]) -> tuple[int, ...]:
-    """Which of a test's photographs have pictures: around buckling, and evenly spaced ones."""
+    """Indices of the photographs shown as pictures: around buckling, and evenly spaced."""
     count = len(moments)
     if count <= MOST_SHOWN:
         return tuple(range(count))
@@ -217,7 +217,7 @@ def shown_moments(moments: Sequence[ImageAmplitude]) -> tuple[int, ...]:
 
 
 def rms_errors(frame: HarvestedFrame, errors: FieldErrors, box: Box) -> dict[str, float]:
-    """Rms standard deviation per component over a box [px], by field; of the pattern with modes."""
+    """Rms standard deviation per component over a box [px], by field; pattern only with modes."""
     inside = box.contains(frame.error_x, frame.error_y[:, None])
     px = frame.result.grid.pixel_size
     squares = {"v0": errors.v0**2, "displacement": errors.displacement**2}
@@ -227,7 +227,7 @@ def rms_errors(frame: HarvestedFrame, errors: FieldErrors, box: Box) -> dict[str
 
 
 _CELLS = 360
-"""Along the images' longer side, at which fields are evaluated for their largest values."""
+"""Number of points along the longer side at which fields' largest values are searched."""
 
 
 def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
@@ -255,7 +255,7 @@ def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, A
 
 
 def _deviations(frame: HarvestedFrame, i: int, rows: FloatArray) -> dict[str, FloatArray | None]:
-    """Standard deviations of ``rows`` @ parameters of mode i; None where they can't be had."""
+    """Standard deviations of ``rows`` @ parameters of mode i; None if not available."""
     part = frame.result.ansatz.phi_slice(i)
     return {
         name: None if errors is None else propagated_sd(rows, errors.covariance[part, part])
@@ -264,7 +264,7 @@ def _deviations(frame: HarvestedFrame, i: int, rows: FloatArray) -> dict[str, Fl
 
 
 def _wave_vectors(harvest: Harvest, frame: HarvestedFrame, i: int) -> list[dict[str, Any]]:
-    """Wave vectors [1/l]: k is in units of half a wavelength's inverse, like the mode's length."""
+    """Wave vectors xi [1/l] of mode i; its own are in units of 1 / (2 ``half_wavelength``)."""
     mode, found = frame.result.ansatz.modes[i], []
     to_xi = harvest.pitch / (2.0 * mode.half_wavelength)
     for w, wave in enumerate(mode.family.waves(frame.result.mode_parameters(i))):
@@ -276,13 +276,13 @@ def _wave_vectors(harvest: Harvest, frame: HarvestedFrame, i: int) -> list[dict[
 
 
 def _few_pixels(harvest: Harvest) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Axes of every few pixels [mm], and which of these are material."""
+    """x and y axes of a subset of pixels [mm], and the material mask on it."""
     grid, step = harvest.grid, max(1, round(max(harvest.grid.shape) / _CELLS))
     return grid.x[::step], grid.y[::step], harvest.mask[::step, ::step]
 
 
 def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
-    """The largest |v| and the largest length of v phi on the material of the mode's own part."""
+    """The largest |v| and the largest length of v phi on material of the mode's region."""
     (x, y, mask), box = _few_pixels(harvest), frame.result.ansatz.modes[i].taper.cellular
     inside = mask & box.contains(x, y[:, None])
     ansatz, a = frame.result.ansatz, frame.result.unknowns
@@ -335,7 +335,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
 
 
 def frame_numbers(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
-    """What ``summary.json`` says of a photograph, which need not be among the harvest's frames."""
+    """Entry of ``summary.json`` for a photograph, also one that is not in ``harvest.frames``."""
     result, identified = frame.result, frame.identifiability
     residual = None if frame.by_contours else result.residual_rms
     moment = next((m for m in harvest.timeline if m.name == frame.name), None)
@@ -373,7 +373,7 @@ def frame_numbers(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
 
 
 def _frame_warnings(frame: HarvestedFrame) -> list[str]:
-    """What identifiability warns of, but for modes that are fixed, as it advises."""
+    """Warnings of identifiability, without those for fixed modes, whose fixing they advise."""
     identified, modes = frame.identifiability, frame.result.ansatz.modes
     first = zip(identified.unobservable, identified.warnings, strict=False)  # those come first
     expected = {warning for i, warning in first if not modes[i].family.size}
@@ -389,7 +389,7 @@ def _whole(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
 
 
 def _contours(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
-    """What speckle and contours say of the modes, and their differences."""
+    """The modes' values by speckle and by contours, and their differences."""
     found = frame.contours
     if found is None:
         return None
@@ -416,7 +416,7 @@ def _contours(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
 
 
 def _values(mode: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float]]:
-    """Name, unit, value and standard deviation of all that a mode is described by."""
+    """Name, unit, value and standard deviation of each quantity that describes a mode."""
     sd = mode["v_max_sd_model_error_mm"]
     yield "largest v", "mm", mode["v_max_mm"], mode["v_max_sd_noise_mm"] if sd is None else sd
     for p in mode["parameters"]:
@@ -429,7 +429,7 @@ def _values(mode: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float]]:
 
 
 def _pattern_ratio(harvest: Harvest, result: Result, other: Result) -> float | None:
-    """One result's pattern over another's, by least squares over the material."""
+    """Ratio of one result's pattern to another's, by least squares over the material."""
     (x, y, mask), modes = _few_pixels(harvest), range(len(result.ansatz.modes))
     a, b = (sum(r.ansatz.fluctuation(i, r.unknowns, x, y)[mask] for i in modes)
             for r in (result, other))  # fmt: skip

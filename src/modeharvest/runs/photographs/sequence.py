@@ -1,7 +1,7 @@
 """Which photographs of a sequence are measured, and what a testing machine recorded with each.
 
-Names stand for files, folders, videos or, with wildcards, many of them. Frames of videos are left
-as TIFF in ``frames/`` of a run's folder, those that are measured alone.
+Names stand for files, folders, videos or, with wildcards, many of them. Only the measured frames of
+a video are written, as TIFF, to ``frames/`` in a run's folder.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ class FrameChoice:
     """Which frames of a sequence are measured; all by default."""
 
     every: int = 1
-    """Only every so many of them, from the first on."""
+    """Measure only every n-th frame, from the first on."""
     frames: tuple[int, ...] = ()
-    """Their numbers: the last in a photograph's name; in a video from 0."""
+    """Numbers of the measured frames: last number in a photograph's name; in a video from 0."""
     between_s: tuple[float, float] | None = None
-    """First and last moment [s] since the sequence began."""
+    """Times [s] of the first and last measured frame, since the sequence began."""
     strains: tuple[float, ...] = ()
-    """Nominal strains by the crosshead, the nearest frame of each [-]; needs a log with a length.
+    """Nominal strains by the crosshead [-]; the frame nearest to each; needs a log with a length.
     """
     per_second: float | None = None
-    """Photographs a second, where neither names nor files tell times."""
+    """Frame rate [photographs per second], used if neither names nor files give times."""
 
     def __post_init__(self) -> None:
         require_within("images: expected every", self.every, 1)
@@ -70,19 +70,19 @@ class ChosenFrames:
 
     reference: Path
     deformed: tuple[Path, ...]
-    """In the order of the test; their stems differ."""
+    """Deformed photographs in the order of the test; their stems are unique."""
     notes: tuple[str, ...] = ()
-    """How they were found and chosen."""
+    """How the photographs were found and chosen."""
     skipped: tuple[tuple[str, str], ...] = ()
-    """Names of files that are none of them, and why."""
+    """Names of files that were left out, and the reasons."""
     recorded: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """By the photographs' names what is known of ``RECORDED``."""
+    """By photograph name: those of the data ``RECORDED`` that are known."""
 
 
 def recorded_with(sequence: ChosenFrames | None, name: str) -> dict[str, Any]:
-    """Number, time since the sequence began, and what was logged, of a photograph.
+    """A photograph's number, time since the sequence began, and logged data.
 
-    None for what isn't known; the keys are ``RECORDED``.
+    The keys are ``RECORDED``; unknown values are None.
     """
     known = sequence.recorded.get(name, {}) if sequence else {}
     return {key: known.get(key) for key in RECORDED}
@@ -91,8 +91,8 @@ def recorded_with(sequence: ChosenFrames | None, name: str) -> dict[str, Any]:
 def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
     """The files that names, folders of photographs, or patterns with wildcards stand for.
 
-    In the order of the numbers in their names. Raises InputError if a pattern matches no file, or,
-    with ``unique``, two have the same stem: results are named by it.
+    Sorted by the numbers in their names. Raises InputError if a pattern matches no file, or, with
+    ``unique``, if two files have the same stem, by which results are named.
     """
     paths: list[Path] = []
     for name in names:
@@ -122,9 +122,9 @@ def chosen_frames(
 ) -> ChosenFrames:  # fmt: skip
     """Find the photographs that names stand for, choose among them, and join a machine's log.
 
-    ``base``: what names are relative to; ``folder``: of the run, where frames of videos go. Raises
-    InputError if nothing is left, or a file can't be used; MissingDependencyError for a video if
-    the library that reads it isn't installed.
+    ``base``: folder to which names are relative; ``folder``: the run's, for frames of videos.
+    Raises InputError if no photograph is chosen, or a file can't be used; MissingDependencyError
+    for a video if the library that reads it isn't installed.
     """
     first = _reference(base, reference)
     frames, notes, skipped = _all_frames(base, deformed, first)
@@ -148,7 +148,7 @@ def chosen_frames(
 
 
 def _reference(base: Path, name: str) -> SequenceFrame:
-    """The frame of the undeformed state; a video's first one, unless it is named as test.mp4#12."""
+    """The frame of the undeformed state; of a video the first, or frame 12 of test.mp4#12."""
     if not is_video(name):
         return SequenceFrame("reference", base / name)
     file, _, number = name.partition("#")
@@ -160,7 +160,7 @@ def _reference(base: Path, name: str) -> SequenceFrame:
 def _all_frames(
     base: Path, names: Sequence[str], reference: SequenceFrame
 ) -> tuple[tuple[SequenceFrame, ...], tuple[str, ...], tuple[tuple[str, str], ...]]:
-    """Every frame but the reference; what is odd about them; files that are left out, and why."""
+    """Every frame except the reference; notes on them; files left out, with reasons."""
     frames: list[SequenceFrame] = []
     skipped: list[tuple[str, str]] = []
     notes: list[str] = []
@@ -188,7 +188,7 @@ def _all_frames(
 def _times(
     frames: Sequence[SequenceFrame], per_second: float | None
 ) -> tuple[list[float] | None, tuple[str, ...]]:
-    """When every frame was taken [s], and by what that is known."""
+    """Time at which each frame was taken [s], and notes on the source of the times."""
     if per_second is not None:
         return [k / per_second for k in range(len(frames))], ()
     if all(frame.time is not None for frame in frames):
@@ -205,7 +205,7 @@ def _times(
 def _recorded(
     frames: Sequence[SequenceFrame], base: Path, log: LogTable
 ) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
-    """What is known of every frame, by its name, and how."""
+    """Recorded data of every frame, by name, and notes on their source."""
     times = np.array([math.nan if f.time is None else f.time for f in frames])
     began = float(times[0]) if len(frames) else 0.0
     known: dict[str, dict[str, Any]] = {
@@ -237,7 +237,7 @@ def _recorded(
 def _chosen(
     frames: Sequence[SequenceFrame], choice: FrameChoice, recorded: Mapping[str, Mapping[str, Any]]
 ) -> tuple[SequenceFrame, ...]:
-    """Those that are chosen; InputError if that is none."""
+    """The chosen frames; InputError if there is none."""
     left = list(frames)
     if choice.frames:
         wanted = set(choice.frames)
@@ -285,7 +285,7 @@ def _at_strains(
 
 
 def _written(frames: Sequence[SequenceFrame], folder: Path, progress: Progress) -> tuple[Path, ...]:
-    """The frames as files; those of videos are left in the run's folder, as a stage of it."""
+    """The frames as files; frames of videos are written to the run's folder, in a stage."""
     wanted: dict[Path, dict[int, Path]] = {}
     paths: list[Path] = []
     for frame in frames:

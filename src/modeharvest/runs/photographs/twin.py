@@ -1,17 +1,17 @@
-"""The twin of a real experiment: photographs as a user has them, harvested, set against the truth.
+"""The twin of a real experiment: simulated photographs, harvested and compared with the truth.
 
 ::
 
-    twin/experiment/        what a user would have, and nothing else
+    twin/experiment/        only what a user of a real test would have
         experiment.toml     files, pixel size, cell size
-        reference.tif  reference_2.tif  deformed_0820.tif ...    as the camera stores them
-        calibration_00.tif ...                                   a target that a stage shifts
+        reference.tif  reference_2.tif  deformed_0820.tif ...    as stored by the camera
+        calibration_00.tif ...                                   target, shifted by a stage
     twin/truth/
-        solution.h5         what the finite elements found
+        solution.h5         the finite element solution
         images/             noise-free images, masks and truth (modeharvest.imaging.imageset)
-        distortion.json     of the lens
-        twin.json           where the stage really went
-    harvest/                all that a harvest leaves; its report also shows the truth
+        distortion.json     distortion of the lens
+        twin.json           true shifts of the stage
+    harvest/                files of the harvest; its report also shows the truth
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ from modeharvest.validation.whole_field import (
 _SIDECAR = "twin.json"
 _EXPERIMENT = resources.files(__package__).joinpath("twin_experiment.txt").read_text("utf-8")
 _WAVES, _AMPLITUDE, _LENS_PX = 1.0, 3.0, 0.05
-"""What must come out: wave vectors within 1 %, v1 within 3 % of the best fit's maximum, S within
+"""Largest accepted errors: wave vectors 1 %, v1 3 % of the best fit's maximum, distortion S
 0.05 px rms without its affine part."""
 _REFIT_WAVES, _REFIT_AMPLITUDE = 0.05, 0.5
-"""What must come out by the whole displacement [%], both against the best fit."""
+"""Largest accepted errors by the whole displacement [%], both against the best fit."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class Twin:
 
     @property
     def experiment(self) -> Path:
-        """The file that a harvest starts from."""
+        """The TOML file of the case to harvest."""
         return self.folder / "experiment" / "experiment.toml"
 
     @property
     def truth(self) -> Path:
-        """The folder of what a user would not have."""
+        """The folder of the truth, which a user of a real test would not have."""
         return self.folder / "truth"
 
     @property
@@ -95,8 +95,8 @@ def make_twin(
 ) -> Twin:
     """Make (or find finished) the photographs of a twin, and its truth.
 
-    ``case`` of a twin, such as the shipped "paper-real-twin"; ``solution`` of its experiment.
-    Raises InputError if the case has no distortion, an image doesn't fit, or the disk refuses.
+    ``case``: of a twin, such as the shipped "paper-real-twin"; ``solution``: of its experiment.
+    Raises InputError if the case has no distortion, an image doesn't fit, or writing fails.
     """
     twin, spec, strains = Twin(Path(folder)), case.imaging, case.experiment.strains
     target = _target(case)
@@ -127,7 +127,7 @@ def make_twin(
 
 
 def _target(case: Case) -> CalibrationTarget:
-    """What the lens is calibrated with; InputError if there is none, or no lens."""
+    """The calibration target of the lens; InputError if there is no target or no lens."""
     if case.calibration is None or case.imaging.distortion is None:
         missing = "imaging.distortion" if case.calibration else "calibration"
         raise InputError(
@@ -138,7 +138,7 @@ def _target(case: Case) -> CalibrationTarget:
 
 
 def _copy_photographs(images: ImageSet, folder: Path) -> list[Path]:
-    """Leave the exposures, and a second one of the reference, from which noise is measured."""
+    """Write the exposures, and a second one of the reference, to measure the noise from."""
     paths = []
     for name, source in _exposures(images):
         paths.append(folder / f"{name}.tif")
@@ -176,7 +176,7 @@ class TwinRun(StagedRun[Case]):
     def all(self) -> dict[str, Any]:
         """Make, harvest, compare; returns the content of the harvest's ``summary.json``.
 
-        Raises InputError if the whole displacement is to be measured with what no user knows.
+        Raises InputError if ``whole_field`` uses exact images or the law of the material.
         """
         how = self.case.whole_field
         if how.material_law or not how.camera:
@@ -193,17 +193,17 @@ class TwinRun(StagedRun[Case]):
             return harvesting.all(self._compare(twin, harvesting))
 
     def _compare(self, twin: Twin, harvesting: HarvestRun) -> HarvestTruth:
-        """Set a harvest, which knows nothing of the truth, against that of its twin."""
+        """Compare a harvest, which does not use the truth, with the truth of its twin."""
         images, results, specimen = twin.images, harvesting.results(), self.case.experiment.specimen
         names = [name for name, _ in _exposures(images) if name != "reference"]
         strains = dict(zip(names, images.strains, strict=True))
         frames, rows = {}, []
         for name in counted(tuple(results), self.progress, "compare with the truth"):
             true = images.truth(strains[name]).displacement
-            # Not the images' own masks: those are as the lens shows them.
+            # Not the masks of the images: these have the lens distortion.
             inside = np.asarray(np.isfinite(true).all(axis=-1))
             result, whole = results[name].result, results[name].whole
-            # The ansatz doesn't describe w, so that other pixels have another best fit.
+            # The ansatz doesn't describe w, so that the best fit depends on the pixels.
             used = inside & harvesting.geometry.mask
             best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, used)
             rows += _frame_rows(name, result, best, true, inside)
@@ -220,7 +220,7 @@ class TwinRun(StagedRun[Case]):
 def _frame_rows(
     name: str, result: Result, best: Result, true: FloatArray, inside: BoolArray
 ) -> list[Expectation]:
-    """What of one photograph was found, against the truth and the best fit of the ansatz."""
+    """Results of one photograph, compared with the truth and the best fit of the ansatz."""
     px, found = result.grid.pixel_size, result.displacement()
     left, lost = (rms(field[inside]) / px for field in (true - found, best.displacement() - found))
     rows = [
@@ -243,7 +243,7 @@ def _frame_rows(
 def whole_checks(
     name: str, refit: Result, best: Result, errors: WholeFieldSummary, inside: BoolArray
 ) -> list[Expectation]:
-    """What of one photograph's whole displacement was found, against the truth."""
+    """Results of one photograph's whole displacement, compared with the truth."""
     of, edges = f"{name}: whole displacement", errors.rms_edges_px
     rows = [
         Expectation(f"{of}: truth − measured, rms", errors.rms_px, "–", None, "px"),
@@ -262,7 +262,7 @@ def whole_checks(
 
 
 def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> Expectation:
-    """Rms difference of two distortions per component, without what is affine in it."""
+    """Rms difference of two distortions per component [px], without its affine part."""
     row, col = np.linspace(0, grid.rows - 1, 60), np.linspace(0, grid.cols - 1, 75)
     found_rms = rms(apart_without_affine(found, true, row[:, None], col[None, :]))
     words = "distortion of the lens: found − true without the affine part, rms per component"

@@ -1,12 +1,12 @@
-"""Photographs measured while a test runs: the pattern's amplitude, and when it will buckle.
+"""Measures photographs while a test runs: pattern amplitude, and the predicted strain of buckling.
 
 ::
 
     watch.html    a page that reloads itself
-    watch.json    what was measured of every photograph, and the predictions; read after a stop
+    watch.json    measurements of every photograph and predictions; read again after a stop
 
-Each photograph is correlated with fixed modes on binned pixels, from where the last two point to.
-What the harvest of all photographs measures in the end is finer, and has error bars of its own.
+Each photograph is correlated with fixed modes on binned pixels; the initial guess is extrapolated
+from the last two. A harvest of all photographs, after the test, is finer and has other error bars.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from modeharvest.validation.growth import Prediction, follow_growth, half_wave
 from modeharvest.validation.onset import mean_strain
 
 _PIXELS = 0.8e6
-"""That a photograph has once it is binned, about."""
+"""Approximate number of pixels of a binned photograph."""
 _DEGREES = AnsatzOptions(v0_degree=5, v_degree=4, gain_degree=0, offset_degree=0)
 _QUICK = CorrelationOptions(
     levels=(Level(2, 1.0), FULL), order=3, gradient="deformed",
@@ -61,29 +61,29 @@ _QUICK = CorrelationOptions(
 )  # fmt: skip
 _CAREFUL = replace(_QUICK, levels=(Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL))
 _SETTLED_S, _GIVEN_UP_S = 0.3, 10.0
-"""A file that hasn't changed for so long is whole; one that can't be read for so long won't be."""
+"""A file unchanged for the first time [s] is complete; one unreadable for the second is damaged."""
 _POLL_S = 0.2
 _COLUMNS = "strain", "amplitude_mm", "sd_mm", "model_sd_mm"
 _PAGE_S = 2.0
-"""Between two pages [s] while photographs are waiting."""
+"""Time between two updates of the page [s] while photographs are waiting."""
 
 
 @dataclass
 class WatchedTest:
-    """What is known so far of a test that is watched."""
+    """Results so far of a test that is watched."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    """Of each photograph: ``name``, ``strain``, ``amplitude_mm``, its standard deviations ``sd_mm``
+    """By photograph: ``name``, ``strain``, ``amplitude_mm``, its standard deviations ``sd_mm``
     by noise and ``model_sd_mm``, ``pattern_px`` (rms of v1 phi1), ``seconds``."""
     skipped: list[dict[str, str]] = field(default_factory=list)
-    """``name`` and ``reason``."""
+    """``name`` and ``reason`` of each photograph that was not measured."""
     conclusion: str = ""
     """Why watching has ended; empty while it goes on."""
     _predicted: list[Prediction | None] = field(default_factory=list)
 
     @classmethod
     def read(cls, path: Path, key: str) -> WatchedTest:
-        """What a watch that was stopped has left; nothing if it was of another test."""
+        """Read the results of a stopped watch; empty if they are of another test."""
         content = read_json(path) if path.is_file() else {}
         if content.get("key") != key:
             return cls()
@@ -101,14 +101,14 @@ class WatchedTest:
         return self._predicted
 
     def summary(self) -> dict[str, Any]:
-        """As plain JSON values."""
+        """The results and predictions as plain JSON values."""
         content = {"frames": self.rows, "skipped": self.skipped, "conclusion": self.conclusion}
         last: Prediction | None = next(reversed(self.predictions), None)
         return {**content, "prediction": to_plain(last)}
 
 
 class QuickMeasurement:
-    """Measures photographs one after the other, with fixed modes, on binned pixels."""
+    """Measures photographs one after another, with fixed modes, on binned pixels."""
 
     def __init__(self, case: PhotographCase) -> None:
         self.case = case
@@ -133,10 +133,10 @@ class QuickMeasurement:
 
     @cached_property
     def ansatz(self) -> Ansatz:
-        """Its first mode is what the lattice of holes allows; InputError if it isn't square.
+        """The ansatz of the lattice's pattern; InputError if this isn't square or rectangular.
 
-        The others are what all cells do alike, from the beginning: beside one speckle or another
-        some of that would be taken for the first.
+        Its first mode is the pattern. The other modes are periodic over all cells, and present from
+        the start of the test: without them, part of that could be taken for the first mode.
         """
         geometry, cell = self.geometry, self.case.specimen.cell_size
         lattice = geometry.lattice
@@ -154,9 +154,9 @@ class QuickMeasurement:
         return Ansatz.on(part.domain, modes, cell, _DEGREES)
 
     def measure(self, path: Path) -> dict[str, Any]:
-        """Measure one photograph; its row of a test.
+        """Measure one photograph; returns its row of :class:`WatchedTest`.
 
-        InputError if it can't be read, is of another kind, or doesn't match the reference.
+        InputError if it can't be read, differs in kind from the reference, or doesn't match it.
         """
         begin = time.perf_counter()
         frame = require_alike(self.reference, read_photograph(path))
@@ -182,13 +182,13 @@ class QuickMeasurement:
 
     @cached_property
     def _few(self) -> tuple[FloatImage, BoolArray, PixelGrid, float]:
-        """The reference binned, whole pixels of its material, their grid, noise [grey levels]."""
+        """Binned reference, mask of its full pixels, their grid, noise sd [grey levels]."""
         image, _ = binned(self.reference.image, None, self.factor)
         mask = binned(self.reference.image, self.geometry.mask, self.factor)[1] > 0.99
         return image, mask, self.grid.binned(self.factor), estimated_noise(image, mask).sd
 
     def _from_the_last(self, pair: ImagePair) -> Result | None:
-        """From where the last two photographs point to; None for the first."""
+        """Correlate, starting from an extrapolation of the last two; None for the first."""
         if self._before is None:
             return None
         now, before = self._before
@@ -198,7 +198,7 @@ class QuickMeasurement:
         return result
 
     def _from_holes(self, frame: Photograph, pair: ImagePair) -> Result:
-        """From where the holes have gone, in whatever order photographs come."""
+        """Correlate, starting from the motion of the holes, in any order of photographs."""
         material = self._material(frame.image)
         images = self.reference.image, frame.image
         whole = ImagePair(*images, self.grid, self.geometry.mask, material)
@@ -214,7 +214,7 @@ class QuickMeasurement:
 
 
 def periodic_families(vectors: FloatArray, cell: float, at: FloatArray) -> list[ModeFamily]:
-    """What all cells of a lattice (2, 2) do alike, first waves about a junction: modes; [mm]."""
+    """Mode families periodic over a lattice (2, 2): first waves about a junction ``at``; [mm]."""
     first, second = 2.0 * cell * np.linalg.inv(vectors).T
     both, apart = first + second, first - second
     parts = [(1, 0, *first)], [(0, 1, *second)], [(1, 0, *both), (1, 0, *apart)]
@@ -227,11 +227,11 @@ def watch(
     case: str | Path, folder: Path, photographs: Path | None = None, *,
     until_still: float | None = None, show: Callable[[str], None] = lambda line: None,
 ) -> WatchedTest:  # fmt: skip
-    """Measure the photographs of a folder as they come; leaves a page that follows the test.
+    """Measure the photographs of a folder as they arrive; writes a page that follows the test.
 
     ``case``: a TOML file of a harvest, whose first ``deformed`` is the folder unless one is given;
-    ``until_still``: the seconds without a new photograph after which it ends, None for never;
-    ``show`` gets a line of the page, then of each photograph. Ends as cleanly when interrupted.
+    ``until_still``: ends after this time without a new photograph [s], None for never; ``show``: is
+    called with a line on the page, then with one for each photograph. Can be interrupted safely.
     Raises InputError if the case, or the reference, can't be used.
     """
     from modeharvest.report.figures.sequence import write_watch_page
@@ -276,7 +276,7 @@ def watch(
 def arriving(
     folder: Path, reference: Path, test: WatchedTest, until_still: float | None
 ) -> Iterator[Path]:
-    """The photographs of a folder, each once it is whole, those that are there already first.
+    """Yield the photographs of a folder when they are complete, those already there first.
 
     Ends when none has come for ``until_still`` seconds.
     """
@@ -296,7 +296,7 @@ def arriving(
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a file is written to its end: it doesn't grow, and can be read, or never will be."""
+    """Whether a file is complete: it doesn't grow, and can be read or is damaged for good."""
     before = path.stat()
     age = time.time() - before.st_mtime
     if age > _GIVEN_UP_S:
@@ -311,7 +311,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def _line(test: WatchedTest) -> str:
-    """A photograph's numbers, and the prediction after it."""
+    """Text with the last photograph's numbers, and the prediction after it."""
     row, found = test.rows[-1], test.predictions[-1]
     text = (
         f"{row['name']}: {100 * row['strain']:.2f} %, pattern {row['pattern_px']:.2f} px, "
