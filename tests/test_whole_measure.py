@@ -14,6 +14,8 @@ from modeharvest.fem.field import Mesh
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.finite_element import cutoff
+from modeharvest.idic.finite_element.cutoff import Risk, best_of, least_risk
 from modeharvest.idic.finite_element.fields import field_of
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
@@ -70,6 +72,21 @@ def test_quadratic_field_from_rest() -> None:
     x, y = result.mesh.nodes.T
     expected = np.stack([0.97 + 0.01 * y, 0.01 + 0.01 * x, -0.016 * x, 1.02 + 0 * x], axis=-1)
     assert np.sqrt(np.mean((F.reshape(-1, 4) - expected) ** 2)) < 2e-3
+
+
+@pytest.mark.parametrize(("lowest", "found"), [(25.0, 25.0), (13.0, 13.0), (5.0, 10.0)])
+def test_the_cut_off_of_least_risk_is_found_down_to_ten_pixels(
+    lowest: float, found: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside the limit trials are unequally spaced; a parabola's vertex is found all the same."""
+
+    def risk(_at: object, px: float, _size: float, _excess: float) -> Risk:
+        return Risk(px, 3.0 + np.log(px / lowest) ** 2, 1.0, 1.0)
+
+    monkeypatch.setattr(cutoff, "risk", risk)
+    tried = least_risk(None, 18.0, 1.0, 1.0)  # type: ignore[arg-type]
+    assert min(one.cutoff_px for one in tried) >= 10.0
+    assert best_of(tried) == pytest.approx(found)
 
 
 def test_error_bars_are_large_where_there_is_no_speckle() -> None:

@@ -48,7 +48,7 @@ _PROBES, _DEGREES = 4, 1.4
 _STEP = 1.4
 """Ratio of neighbouring cut-off wavelengths in the search."""
 _TINY = float(np.finfo(np.float64).tiny)
-_LEAST_PX, _MOST_PX = 10.0, 400.0
+_LEAST_PX, _MOST_PX = 10.0, 400.0  # one within 5 % of the least counts as the least
 """Bounds of the search; shorter ones expose nodes to errors of image splines at edges."""
 _STRONGER = 4.0
 """Weight of the regularisation that shows its bias, over the weight used [-]."""
@@ -95,9 +95,9 @@ def least_risk(
     while True:
         best = min(tried, key=lambda k: tried[k].value)
         missing = [k for k in (best - 1, best + 1) if k not in tried]
-        if not missing or not _LEAST_PX < tried[best].cutoff_px / 1.05 < _MOST_PX:
+        if not missing or not 1.05 * _LEAST_PX < tried[best].cutoff_px < _MOST_PX:
             return tuple(tried[k] for k in sorted(tried))
-        cutoff = max(first_px * _STEP ** missing[0], min(first_px, _LEAST_PX))
+        cutoff = max(first_px * _STEP ** missing[0], _LEAST_PX)
         tried[missing[0]] = risk(at, cutoff, pixel_size, excess)
 
 
