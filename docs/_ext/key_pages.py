@@ -293,7 +293,7 @@ def page(title: str, model: type[CaseModel], command: str, others: dict[type[Any
     for name in command.split(" and "):
         text += f"Run by ``modeharvest {name}``. "
     text += "Ranges are those that the checks accept beside the defaults of all other keys.\n\n"
-    rows = [("``title``", "text", "", '``""``', "", "Of the report.")]
+    rows = [("``title``", "text", "", '``""``', "", "Title of the report.")]
     plain = []
     for name, field in model.model_fields.items():
         hint = get_type_hints(model, include_extras=True)[name]
@@ -302,7 +302,7 @@ def page(title: str, model: type[CaseModel], command: str, others: dict[type[Any
             kind = plain_type(hint)
             about = docstrings(model).get(name, "")
             default = "" if field.default in (None, ...) else f"``{field.default}``"
-            rows.append((f"``{name}``", kind, "", default, "", about))
+            rows.append((f"``{name}``", kind, unit(name, about, kind), default, "", about))
         plain += tables
     text += table(HEAD, rows, "16 12 8 14 16 34")
     for path, cls, kind in plain:
