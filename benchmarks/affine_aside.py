@@ -1,9 +1,9 @@
-"""Two distortions compared with their affine parts aside.
+"""Compare two lens distortions up to an affine map; used by distortion.py.
 
-Photographs of a target under unknown shifts look the same for phi_S and for phi_S after any affine
-map A, because A turns shifts into shifts. So two distortions are compared after the A that brings
-them nearest to each other; with S of 15 px over 1000 px, to subtract the affine part of S itself
-would be wrong by some tenths of a px.
+Photographs of a target under unknown shifts are the same for phi_S and for phi_S after any affine
+map A, because A turns shifts into shifts. The difference is therefore taken after the A that makes
+it smallest. Subtracting the affine parts of S instead would be wrong by some tenths of a px for an
+S of 15 px over 1000 px (docs/how-to/distortion.md).
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from modeharvest.imaging.distortion.lens import Distortion
 FloatArray = NDArray[np.float64]
 
 _LINES = 33
-"""Of the grid on which distortions are compared."""
+"""Number of rows and of columns of the grid on which distortions are compared."""
 
 
 @dataclass(frozen=True, eq=False)
 class AffineAside:
-    """The difference of two distortions whose affine parts don't count.
+    """Difference of two distortions up to an affine map.
 
     Parameters
     ----------
     rms_px, largest_px
         Over the image: rms per component; largest length [px].
     difference
-        (2, 33, 33) phi_found(x) - phi_truth(A x), along rows and columns, on an even grid over
+        (2, 33, 33) phi_found(x) - phi_truth(A x), along rows and columns, on a regular grid over
         the image [px].
     matrix, offset
-        (2, 2), (2,) of A x = matrix x + offset, x = (row, col) [px].
+        (2, 2) and (2,): A x = matrix x + offset, with x = (row, col) [px].
     """
 
     rms_px: float
@@ -44,7 +44,7 @@ class AffineAside:
 
 
 def affine_aside(found: Distortion, truth: Distortion, shape: tuple[int, int]) -> AffineAside:
-    """Compare two distortions over an image of ``shape`` (rows, cols) [px], affine part aside."""
+    """Compare two distortions up to an affine map, over an image of ``shape`` (rows, cols) [px]."""
     axes = [np.linspace(0.0, n - 1.0, _LINES) for n in shape]
     row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     seen = np.stack(found.observed(row, col))

@@ -1,13 +1,13 @@
-"""Bloch analysis of infinite lattices: its cost, its critical strains by mesh size, its rates.
+"""Bloch analysis of infinite lattices: its cost, critical strains, convergence and branches.
 
-``scripts/env python benchmarks/bloch_scan.py cost`` compares a scan of 60 wave vectors along the
-zone's boundary, assembly and all, with 60 sparse factorisations of the reduced complex matrix whose
-order of elimination is known, or found anew each time. They take turns in one process, and the
-ratios are medians over the turns.
-``… critical`` prints the table of docs/explanation/bloch.md, ``… rates`` the order of convergence
-on nested meshes, ``… splitting`` what a mesh does to a degenerate set, ``… distances`` which
-branches are found from loads that aren't critical, and ``… study`` ten lattices under three
-loadings with the time and the memory they take.
+Run: scripts/env python benchmarks/bloch_scan.py TABLE [--sizes 12 24] [--meshes 4], where TABLE is
+``cost`` (time of a scan of 60 wave vectors along the zone's boundary, assembly included, over that
+of 60 sparse factorisations of the reduced complex matrix with a known or a new elimination order;
+medians of alternate turns in one process), ``critical`` (critical strains by mesh size), ``rates``
+(order of convergence on nested meshes), ``splitting`` (of a degenerate set by a mesh),
+``distances`` (branches from loads that aren't critical) or ``study`` (ten lattices under three
+loadings, with time and memory). Tables: docs/explanation/bloch.md; of ``distances``:
+docs/explanation/modes.md.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def nested(cell: UnitCell, diameter: float, count: int) -> list[UnitCell]:
 
 
 def rate(cells: Sequence[UnitCell], loading: MacroLoading, material: Material) -> str:
-    """Critical strain of one wave mesh by mesh, and the orders of its convergence."""
+    """Critical strain of one wave on each mesh [%], and its orders of convergence."""
     search = CriticalSearch()
     paths = [CellPath(PeriodicCell(cell, material), loading) for cell in cells]
     wave = first_critical(paths[0]).waves[0]
@@ -146,7 +146,7 @@ def rates(count: int) -> None:
 
 
 def rhombus(size: float, ratio: float = 0.9) -> UnitCell:
-    """A cell of hexagonal stacking as gmsh meshes it, without the lattice's symmetry."""
+    """A rhombic cell of hexagonal stacking in gmsh's mesh, without the lattice's symmetry."""
     vectors = np.array([[1.0, 0.0], [0.5, 0.75**0.5]])
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
@@ -163,9 +163,9 @@ def rhombus(size: float, ratio: float = 0.9) -> UnitCell:
 
 
 def splitting(size: float) -> None:
-    """By how much gmsh's mesh of a rhombus splits the three M points of hexagonal stacking.
+    """Print how much gmsh's mesh of a rhombus splits the three M points of hexagonal stacking.
 
-    And which branches start at the critical load of the first one.
+    Also which branches start at the critical load of the first of them.
     """
     cell = rhombus(size)
     path = CellPath(PeriodicCell(cell, TwoTermI1()), equibiaxial())
@@ -180,12 +180,12 @@ def splitting(size: float) -> None:
 
 
 SHARES = (1.0, 0.99, 0.97, 0.9)
-"""Of a critical load."""
+"""Loads at which modes are computed, as fractions of the critical load [-]."""
 
 
 def distances() -> None:
-    """How far from critical the modes of other loads are, and the branches found from there."""
-    postbuckling._CRITICAL = np.inf  # nothing is refused
+    """Print how far modes at lower loads are from critical, and the energies of their branches."""
+    postbuckling._CRITICAL = np.inf  # no mode is refused
     print("| lattice | loading |", *(f"from {share:.0%}: distance, energy |" for share in SHARES))
     print("|---|---|" + "---|" * len(SHARES))
     for name, cell, loading in (

@@ -1,16 +1,16 @@
-"""What a campaign costs: one worker against two, the overhead of cases of a second, the start.
+"""Cost of a campaign: speed-up by a second worker, overhead of short cases, start of workers.
 
-Three questions, each answered by whole campaigns, their workers' start included and apart:
+Three quantities, each measured by whole campaigns, with and without the start of their workers:
 
-* speedup: correlations of the paper's images at a reduced resolution from perturbed guesses, by
-  one worker and by two;
-* overhead: cases that sleep for a second, on two workers: what the campaign takes beyond that.
-* start: cases that do nothing, run by forks of a server process, as campaigns are, and by new
+* speedup: correlations of the paper's images from perturbed guesses, by one worker and by two;
+* overhead: cases that sleep for a second, on two workers: the time beyond the ideal one;
+* start: cases that do nothing, run by forks of a server process, as in a campaign, and by new
   processes, dask's default.
 
-The machine should have two idle cores.
+The machine should have two idle cores. Results: docs/how-to/studies.md.
 
 Run: scripts/env python benchmarks/campaign.py [--guesses 24] [--sleeps 60] [--pixel 0.02]
+     [--repetitions 5]
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class Timing:
     Parameters
     ----------
     whole
-        All of it.
+        Of the whole campaign.
     first, last
-        Until the first case was done (what starting the workers takes, and one case), and until
-        the last was: the rest is stopping them.
+        Until the first case was done (start of the workers and one case), and until the last one
+        was; the rest is stopping the workers.
     """
 
     whole: float
@@ -50,13 +50,13 @@ class Timing:
 
 
 def sleep(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
-    """A case that takes exactly that long."""
+    """Sleep for ``case["seconds"]``: a case of known duration."""
     time.sleep(case["seconds"])
     return {}
 
 
 def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int, method: str) -> Timing:
-    """Run a campaign and look at the clock."""
+    """Run a campaign and time it; ``method`` is how worker processes are started."""
     LOCAL["distributed.worker.multiprocessing-method"] = method
     campaign = Campaign(function, cases, folder)
     begin, ticks = time.perf_counter(), []
@@ -73,15 +73,15 @@ def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int, meth
 def alone(
     function: str, cases: tuple[Case, ...], folder: Path, workers: int, method: str = "forkserver"
 ) -> Timing:
-    """The same in a process of its own: workers of an earlier campaign would make it faster."""
+    """The same in a new process, because an earlier campaign in this one would make it faster."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         return process.submit(run, function, cases, folder, workers, method).result()
 
 
 def speedup(guesses: int, pixel: float, folder: Path) -> None:
-    """One worker against two."""
+    """Print the times of campaigns with one worker and with two."""
     from modeharvest.fem.field import Solution
-    from modeharvest.runs.case import shipped_solution  # here: workers import this file, too
+    from modeharvest.runs.case import shipped_solution  # here, because workers import this file
     from modeharvest.runs.study import StudyCase
     from modeharvest.validation.studies.robustness import RobustnessStudy
     from modeharvest.validation.studies.study import ImagePairSpec
@@ -92,7 +92,7 @@ def speedup(guesses: int, pixel: float, folder: Path) -> None:
     spec = ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
     study = RobustnessStudy(initial_guesses=guesses, radii=(), strain_errors=())
     found = {}
-    for workers in (1, 2, 2, 1):  # so that a drift of the machine hits both alike
+    for workers in (1, 2, 2, 1):  # a drift of the machine affects both alike
         own = folder / f"{workers}-{len(found)}-{time.perf_counter_ns()}"
         cases = study.prepare(spec, own)
         timing = alone(study.function, cases, own, workers)
@@ -106,7 +106,7 @@ def speedup(guesses: int, pixel: float, folder: Path) -> None:
 
 
 def overhead(sleeps: int, folder: Path) -> None:
-    """Cases of a second on two workers."""
+    """Print the overhead of cases of one second on two workers."""
     cases = grid({"seconds": SLEEP_S, "number": 0}, number=list(range(sleeps)))
     timing = alone("campaign:sleep", cases, folder, 2)
     ideal = SLEEP_S * sleeps / 2
@@ -118,7 +118,7 @@ def overhead(sleeps: int, folder: Path) -> None:
 
 
 def start(repetitions: int, folder: Path) -> None:
-    """Forks of a server process against new processes, in turn."""
+    """Print start times with forks of a server process and with new processes, alternately."""
     found: dict[str, list[Timing]] = {}
     for n in range(repetitions):
         for method in ("forkserver", "spawn"):

@@ -1,4 +1,4 @@
-"""How well contours alone give the displacement of a specimen without speckle.
+"""Errors and intervals of the displacement that contours give, of a specimen without speckle.
 
 ::
 
@@ -6,11 +6,11 @@
         [--picture docs/images/contours_part.png]
 
 The shipped specimen, buckled at a nominal strain of 12.8 %, is photographed without speckle: pixels
-that average, a lens of 0.6 px, 8 bits. A row changes one thing. The specimen's law, Ogden of
-exponent 3, isn't the one that is assumed, except where the row says so. With seeds instead: how
-often 95 % intervals hold, of u and of the ansatz refitted to it, over noise of 1 % and sizes of
-pixels up to a tenth larger, hence edges that lie otherwise on the pixels. A picture shows the row
-"middle" instead.
+average over their area, blur of 0.6 px, 8 bits. Each row changes one condition. The specimen's law
+(Ogden, exponent 3) isn't the assumed one (neo-Hookean), except in rows that name a law. --seeds
+prints instead how often 95 % intervals of u and of the refitted ansatz hold, over seeds of 1 %
+noise and pixels up to a tenth larger, which shift edges. --picture draws the row "middle" instead.
+Results: docs/explanation/contours.md.
 """
 
 from __future__ import annotations
@@ -34,10 +34,12 @@ from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.finite_element.contours import displacement_from_contours
+from modeharvest.idic.finite_element.contours.measure import displacement_from_contours
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import NodalResult, refitted
-from modeharvest.idic.photograph.plain import displacement_of_plain, matched_contours, plain_surface
+from modeharvest.idic.photograph.plain.matching import matched_contours
+from modeharvest.idic.photograph.plain.measure import displacement_of_plain
+from modeharvest.idic.photograph.plain.surface import plain_surface
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
@@ -61,7 +63,7 @@ FINE = 8
 
 @dataclass(frozen=True)
 class Row:
-    """What is changed."""
+    """Conditions of one row of the table; ``noise`` is a standard deviation [of full scale]."""
 
     name: str
     noise: float = 0.01
@@ -72,39 +74,39 @@ class Row:
     law: Material | None = None
     rows: tuple[float, float] = (0.0, 1.0)
     cols: tuple[float, float] = (0.0, 1.0)
-    """The part of the pictures that is taken."""
+    """Part of the pictures in view, as fractions of their height and width [-]."""
     dots: float = 0.0
-    """Diameter of those painted between any four holes [mm]; 0 for none."""
+    """Diameter of dots painted between any four holes [mm]; 0 for none."""
 
     @property
     def is_part(self) -> bool:
-        """Whether not all is in view."""
+        """Whether only a part of the pictures is in view."""
         return (self.rows, self.cols) != ((0.0, 1.0), (0.0, 1.0))
 
     def window(self, shape: tuple[int, ...]) -> tuple[slice, ...]:
-        """Of pictures (rows, cols)."""
+        """Slices of the rows and columns in view, of pictures of ``shape`` (rows, cols)."""
         parts = zip((self.rows, self.cols), shape, strict=True)
         return tuple(slice(round(a * n), round(b * n)) for (a, b), n in parts)
 
 
 def light(image: FloatImage) -> FloatImage:
-    """A quarter brighter on one side, a fifth darker below."""
+    """Uneven light: up to 25 % brighter at the right edge, 20 % darker at the lower one."""
     x, y = (np.linspace(-1.0, 1.0, n) for n in image.shape[::-1])
     return np.asarray(image * (1.0 + 0.25 * x - 0.2 * y[:, None]), dtype=np.float32)
 
 
 def negative(image: FloatImage) -> FloatImage:
-    """Dark material on bright."""
+    """Dark material on a bright background."""
     return np.float32(0.85) - image
 
 
 def thresholded(image: FloatImage) -> FloatImage:
-    """Two grey levels."""
+    """Pixels thresholded to two grey levels."""
     return np.where(image > 0.43, np.float32(0.7), np.float32(0.15))
 
 
 def weaker(image: FloatImage) -> FloatImage:
-    """Less contrast."""
+    """Contrast lowered to 0.8."""
     return np.float32(0.8) * image + np.float32(0.05)
 
 
@@ -127,7 +129,7 @@ ROWS = (
 
 
 def turned(image: FloatImage, turn: float) -> FloatImage:
-    """An image turned anticlockwise about its middle [rad]."""
+    """An image rotated anticlockwise about its centre by ``turn`` [rad]."""
     middle = (np.array(image.shape) - 1.0) / 2.0
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     at = (np.indices(image.shape).reshape(2, -1).T - middle) @ R + middle
@@ -137,9 +139,9 @@ def turned(image: FloatImage, turn: float) -> FloatImage:
 def painted(
     image: FloatImage, edges: Sequence[FloatArray], grey: float = 0.15, psf_px: float = 0.6
 ) -> FloatImage:
-    """An image with areas painted over, inside of polygons (n, 2) of (row, col), as pixels average.
+    """Paint polygons (n, 2) of (row, col) [px] on an image, each pixel averaged over its area.
 
-    The polygons are as the deformed material has them: dots are rendered on their own.
+    Polygons are those of the state in the image; dots of each state are rendered separately.
     """
     share = np.zeros(image.shape)
     for points in edges:
@@ -154,7 +156,7 @@ def painted(
 
 
 def dots(pair: ImagePair, diameter: float) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Edges of dots between any four holes in both of a specimen's images, (n, 2) of (row, col)."""
+    """Edges of dots between any four holes, in both images of a pair: (n, 2) of (row, col) [px]."""
     specimen = Solution.read(SHIPPED).specimen
     assert specimen
     assert pair.truth
@@ -175,7 +177,7 @@ def dots(pair: ImagePair, diameter: float) -> tuple[list[FloatArray], list[Float
 def photographs(
     folder: Path, row: Row, seed: int, pair: ImagePair | None = None
 ) -> tuple[FloatImage, FloatImage]:
-    """The two pictures of a row, 8 bit; of a ``pair`` if there are dots."""
+    """The two 8-bit pictures of a row [0 ... 255]; ``pair`` is needed for rows with dots."""
     rng, tag = np.random.default_rng(seed), f"deformed_{round(1e4 * row.strain):04d}"
     f, g = (read_image(folder / f"{name}.tif") for name in ("reference", tag))
     if row.dots and pair:
@@ -187,7 +189,7 @@ def photographs(
 
 
 def truth(u: FloatArray, grid: PixelGrid, turn: float) -> FloatArray:
-    """(rows, cols, 2) displacement u [mm], and then a turn about the image's middle."""
+    """(rows, cols, 2) displacement [mm]: u, then a rotation by ``turn`` [rad] about the centre."""
     middle = np.array([0.5 * (grid.x[0] + grid.x[-1]), 0.5 * (grid.y[0] + grid.y[-1])])
     X = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -197,7 +199,7 @@ def truth(u: FloatArray, grid: PixelGrid, turn: float) -> FloatArray:
 def measured(
     folder: Path, grid: PixelGrid, row: Row, seed: int, pair: ImagePair | None = None
 ) -> NodalResult:
-    """The displacement in a row's pictures."""
+    """Measure the displacement in a row's pictures by their contours."""
     f, g = photographs(folder, row, seed, pair)
     seen = [plain_surface(image) for image in (f, g)]
     assert seen[0]
@@ -211,7 +213,7 @@ def measured(
 
 
 def imaged(pixel_size: float, folder: Path) -> dict[float, ImagePair]:
-    """The shipped specimen's images and truth, by nominal strain."""
+    """Make images of the shipped specimen; returns pairs with truth, by nominal strain."""
     spec = ImagingSpec(
         pixel_size, MARGIN_PX, background=0.15, speckle=SpeckleSpec(dark=0.7, bright=0.7),
         sensor=Sensor(fill_factor=1.0, psf_px=0.6), bits=8,
@@ -235,7 +237,7 @@ def rows(pixel_size: float, only: list[str]) -> Iterator[str]:
             u = truth(u, grid, np.deg2rad(row.turn_deg))
             off, sd, there = compared(found, u)
             ratio = waves = float("nan")
-            if not (row.turn_deg or row.is_part) and row.strain > 0.1:  # one frame, and a pattern
+            if not (row.turn_deg or row.is_part) and row.strain > 0.1:  # unrotated, whole, buckled
                 ratio, waves = against_best_fit(*refits(specimen, found, u, there, row.strain))
             line = [
                 np.sqrt(np.mean(off**2)) / px, np.linalg.norm(off, axis=1).max() / px,
@@ -246,7 +248,7 @@ def rows(pixel_size: float, only: list[str]) -> Iterator[str]:
 
 
 def compared(found: NodalResult, u: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """(p, 2) error and standard deviation [mm] at the pixels (rows, cols) where both are known."""
+    """(p, 2) errors and standard deviations [mm], and the pixels (rows, cols) where both exist."""
     displacement = found.displacement_on()
     there = np.isfinite(u[..., 0]) & np.isfinite(displacement[..., 0])
     return (displacement - u)[there], found.standard_deviation_on()[there], there
@@ -255,7 +257,7 @@ def compared(found: NodalResult, u: FloatArray) -> tuple[FloatArray, FloatArray,
 def refits(
     specimen: Specimen, found: NodalResult, u: FloatArray, there: NDArray[np.bool_], strain: float
 ) -> tuple[Result, Result]:
-    """The ansatz refitted to what was measured, and its best fit to the truth."""
+    """The ansatz refitted to the measured displacement, and its best fit to the truth."""
     ansatz = Ansatz.square(specimen)
     best = fit_displacement(u, found.grid, ansatz, ansatz.initial_guess(strain), there)
     return refitted(found, ansatz, best.unknowns, there), best
@@ -271,7 +273,7 @@ def statistics(pixel_size: float, seeds: int) -> Iterator[str]:
             pair = imaged(pixel_size * (1.0 + 0.1 * seed / seeds), Path(name))[row.strain]
             found = measured(Path(name), pair.grid, row, seed)
             assert pair.truth
-            u = pair.truth.displacement  # read while it is there
+            u = pair.truth.displacement  # read before the folder is removed
         off, sd, there = compared(found, u)
         z = off / sd
         own, best = refits(specimen, found, u, there, row.strain)
@@ -284,7 +286,7 @@ def statistics(pixel_size: float, seeds: int) -> Iterator[str]:
 
 
 def against_best_fit(own: Result, best: Result) -> tuple[float, float]:
-    """v1 phi1 over that of the best fit, less 1, and the wave vectors' largest difference [%]."""
+    """Relative errors against the best fit [%]: v1 phi1, and the largest of the wave vectors."""
     ansatz, box = own.ansatz, own.ansatz.modes[0].taper.cellular
     x, y = np.linspace(box.x_min, box.x_max, 200), np.linspace(box.y_min, box.y_max, 200)
     a, b = (ansatz.fluctuation(0, fit.unknowns, x[None], y[:, None]) for fit in (own, best))
@@ -294,7 +296,7 @@ def against_best_fit(own: Result, best: Result) -> tuple[float, float]:
 
 
 def draw(pixel_size: float, file: Path) -> None:
-    """The deformed picture of the row "middle", |u| in it, and its error."""
+    """Draw both pictures of the row "middle", |u| and its error."""
     row = next(row for row in ROWS if row.name == "middle")
     with tempfile.TemporaryDirectory() as name:
         pair = imaged(pixel_size, Path(name))[row.strain]

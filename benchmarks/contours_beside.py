@@ -1,4 +1,4 @@
-"""How well contours measure a speckled specimen's modes, and how they agree with the speckle.
+"""Modes of a speckled specimen measured by its contours: errors, and agreement with the speckle.
 
 ::
 
@@ -6,11 +6,11 @@
         [--in-view 0.8]
 
 The shipped specimen at nominal strains of 7.8 % and 12.8 % is photographed with the paper's speckle
-on a dark background: pixels that average, a lens of 0.6 px, 8 bits, noise of 1 %; speckle and noise
-are each seed's own. Each harvest measures by speckle and by contours; both are set against the best
-fit of the ansatz to the true displacement, and against each other. Of a part in view, the middle
-share of the picture's height and width, both are compared where contours measure: farther than a
-cell from the picture's border.
+on a dark background: pixels average over their area, blur of 0.6 px, 8 bits, noise of 1 %; each
+seed has its own speckle and noise. Each harvest measures by speckle and by contours. Both are
+compared with the best fit of the ansatz to the true displacement, and with each other. --in-view
+keeps this middle part of the picture's height and width; both are then compared farther than a cell
+from the border, where contours measure. Tables: docs/explanation/contours_beside.md.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.photograph.geometry import box_of
-from modeharvest.idic.photograph.plain import away_from_cuts
+from modeharvest.idic.photograph.plain.surface import away_from_cuts
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.photographs.files import write_image
@@ -56,7 +56,7 @@ measure = true
 
 
 def z_by_part(found: Result, best: Result) -> dict[str, FloatArray]:
-    """Errors over their standard deviations, of v0, v1 and phi1, by all that errors count."""
+    """Errors of the unknowns of v0, v1 and phi1 over their standard deviations by model error."""
     assert found.errors
     covariance = found.errors.by_model_error
     assert covariance is not None
@@ -67,9 +67,9 @@ def z_by_part(found: Result, best: Result) -> dict[str, FloatArray]:
 
 
 def v_percent_in(box: Box, found: Result, best: Result) -> tuple[float, float]:
-    """Largest difference of v1 from the best fit's in the cellular part of a box, of its largest.
+    """Difference of v1 from the best fit's in the cellular part of a box [%].
 
-    And its rms, of its rms [%].
+    The largest over the best fit's largest value, and the rms over its rms.
     """
     own = best.ansatz.modes[0].taper.cellular
     x = np.linspace(max(box.x_min, own.x_min), min(box.x_max, own.x_max), POINTS)
@@ -80,7 +80,7 @@ def v_percent_in(box: Box, found: Result, best: Result) -> tuple[float, float]:
 
 
 def photographed(folder: Path, pixel_size: float, seed: int) -> ImageSet:
-    """Photographs with a seed's own speckle and noise, and their truth."""
+    """Make photographs with a seed's own speckle and noise, and their truth."""
     speckle = SpeckleSpec(standard_deviation=0.08, blur_px=1.5, seed=seed)
     sensor = Sensor(fill_factor=1.0, psf_px=0.6, read_noise=0.01, read_seed=seed)
     spec = ImagingSpec(pixel_size, 40, background=0.06, speckle=speckle, sensor=sensor, bits=8)

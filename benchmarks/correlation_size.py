@@ -1,10 +1,10 @@
-"""How the cost of a correlation grows: with the pixels, and with the degree of the polynomials.
+"""How the cost of a correlation grows with the number of pixels and the degree of polynomials.
 
-The paper's ansatz on ever finer images of the same specimen, everywhere material, a pattern of
-10 px; f is sampled from g's spline at the displacement to find, and noise is added to both. The
-start has the applied strain, as in the paper, and is some 3 px off. Everything that a user
-waits for is timed: checks, pyramid, iterations, judgement. Memory is the most that is allocated
-beside the input.
+The paper's ansatz is correlated on images of 1 to 50 Mpx of the same specimen, with material
+everywhere and a pattern of 10 px. f is sampled from the spline of g at the true displacement, and
+noise is added to both. The start has the applied strain, as in the paper, and is some 3 px off.
+Times include checks, pyramid, iterations and assessment; memory is the peak allocated beside the
+input. Degrees of 3 to 12 are compared at 4 Mpx. Results: docs/explanation/idic.md.
 
 Run: scripts/env python benchmarks/correlation_size.py [--quick] [--save FILE.json]
 """
@@ -49,7 +49,7 @@ Row = dict[str, Any]
 
 
 class Pair:
-    """Two images of so many megapixels, and where to start."""
+    """Two images of ``mpx`` megapixels, with mask and initial guess."""
 
     def __init__(self, mpx: float, ansatz: Ansatz) -> None:
         rows = round(np.sqrt(1e6 * mpx / ASPECT))
@@ -67,7 +67,7 @@ class Pair:
             image += NOISE * rng.standard_normal(image.shape, dtype=np.float32)
 
     def _truth(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Unknowns that move the low orders by about a pixel each."""
+        """True unknowns: the start with its low orders changed by about a pixel each."""
         a, step = self.start.copy(), OFF_PX * self.grid.pixel_size
         for c in (0, 1):
             a[self.ansatz.v0_slice(c)][:6] += step * rng.normal(size=6)
@@ -75,7 +75,7 @@ class Pair:
         return a
 
     def correlate(self, options: CorrelationOptions | None = None) -> Result:
-        """Start to end."""
+        """Correlate from the start to convergence."""
         return correlate(
             ImagePair(self.f, self.g, self.grid, self.mask),
             self.ansatz,
@@ -84,8 +84,8 @@ class Pair:
         )
 
     def peak_images(self) -> float:
-        """Most that a correlation allocates [float32 images of the size]."""
-        # The memory doesn't depend on how many iterations there are.
+        """Peak memory that a correlation allocates [float32 images of this size]."""
+        # The memory doesn't depend on the number of iterations.
         options = CorrelationOptions(gauss_newton=GaussNewtonOptions(max_iterations=1))
         tracemalloc.start()
         self.correlate(options)
@@ -95,7 +95,7 @@ class Pair:
 
 
 def median_s(work: Callable[[], object], laps: int = LAPS) -> float:
-    """Seconds, the median of some laps."""
+    """Median wall-clock time of some laps [s]."""
     seconds = []
     for _ in range(laps):
         begin = time.perf_counter()
@@ -105,7 +105,7 @@ def median_s(work: Callable[[], object], laps: int = LAPS) -> float:
 
 
 def measured(mpx: float, ansatz: Ansatz) -> Row:
-    """One row of either table."""
+    """Measure one row of either table."""
     pair = Pair(mpx, ansatz)
     result = pair.correlate()
     pixels = int(pair.mask.sum())
@@ -149,7 +149,7 @@ def shown(rows: list[Row]) -> None:
 
 
 def exponent(rows: list[Row], of: str, over: str) -> float:
-    """Slope of the logarithms."""
+    """Exponent of the power law between two columns: slope of their logarithms."""
     x, y = (np.log([r[key] for r in rows]) for key in (over, of))
     return float(np.polyfit(x, y, 1)[0])
 

@@ -1,13 +1,13 @@
-"""Whether a correlation's errors are at the Cramer-Rao bound, by Monte Carlo.
+"""Errors of the correlation compared with the Cramer-Rao bound, by Monte Carlo.
 
-The truth is inside the ansatz (77 unknowns, a pattern everywhere, 320 x 360 px), the images are
-exact. Noise is added; each realisation has a speckle of its own and comes twice, as n and as -n:
-what the mean of the two errors leaves is of second order in the noise, so a bias shows long
-before it would out of the scatter.
+The true displacement is in the ansatz (77 unknowns, a pattern everywhere, 360 x 320 px), and images
+are exact before noise is added. Each realisation has its own speckle, and is used with noise n and
+with -n: the mean of the two errors is of second order in the noise, so it shows a bias that the
+scatter would hide. The bound is that of known_truth.py, which doesn't use the correlation's matrix.
+Ten minutes of processor time; tables: docs/explanation/metrology.md.
 
-The bound is that of benchmarks/known_truth.py, made without the correlation's own matrix.
-
-Run: scripts/env python benchmarks/cramer_rao.py [--pairs 100] [--only TEXT] [--json FILE]
+Run: scripts/env python benchmarks/cramer_rao.py [--pairs 100] [--only TEXT] [--standard-start]
+     [--json FILE]
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ FloatArray = NDArray[np.float64]
 
 ROUNDING = 1 / (255 * np.sqrt(12))
 EVERY = 8
-"""Fields are compared at every eighth pixel: they are as smooth as the ansatz."""
+"""Fields are compared at every eighth pixel, because they are as smooth as the ansatz."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What is wrong with the images, and how they are correlated.
+    """Noise of the images, and options of their correlation.
 
     Parameters
     ----------
     name
-        For the table.
+        Name in the table.
     in_f, in_g
         Standard deviations [fraction of full scale].
     rounded
-        No noise but that of rounding to 8 bits.
+        Whether the noise is that of rounding to 8 bits alone.
     gradient, blur_px
-        Of :class:`CorrelationOptions`.
+        ``gradient`` and ``gradient_blur_px`` of :class:`CorrelationOptions`.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Noise:
     blur_px: float | None = None
 
     def draw(self, f: FloatArray, g: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
-        """Make a realisation for both images."""
+        """Draw a realisation of the noise of f and of g [fraction of full scale]."""
         if self.rounded:
             return np.rint(255 * f) / 255 - f, np.rint(255 * g) / 255 - g
         normal = np.random.default_rng([seed, 1]).normal(size=(2, *f.shape))
@@ -72,7 +72,7 @@ class Noise:
 
     @property
     def known(self) -> ImageNoise:
-        """As the results are given it."""
+        """The noise that is given to the results' covariances."""
         return ImageNoise(self.in_f, self.in_g)
 
 
@@ -98,11 +98,11 @@ class Quantity:
     Parameters
     ----------
     name
-        For the table.
+        Name in the table.
     of
-        From unknowns to an array of any shape.
+        Function from the unknowns (n,) to an array (...).
     S
-        (..., n) its derivatives.
+        (..., n) derivatives by the unknowns.
     """
 
     name: str
@@ -110,12 +110,12 @@ class Quantity:
     S: FloatArray
 
     def sd(self, covariance: FloatArray) -> FloatArray:
-        """(...): the standard deviations that a covariance of the unknowns means."""
+        """(...) standard deviations that follow from a covariance (n, n) of the unknowns."""
         return np.sqrt(np.einsum("...n,...n->...", self.S @ covariance, self.S))
 
 
 def quantities(truth: Truth) -> list[Quantity]:
-    """u, v0, v1, v1 phi1 and the unknowns."""
+    """The compared quantities: u, v0, v1, v1 phi1 and the unknowns."""
     ansatz = truth.ansatz
     row, col = (at[(truth.used[0] % EVERY == 0) & (truth.used[1] % EVERY == 0)]
                 for at in truth.used)  # fmt: skip
@@ -143,7 +143,7 @@ class Realisation:
     Parameters
     ----------
     bound
-        (n, n) covariance.
+        (n, n) covariance of the unknowns at the bound.
     found
         The two results.
     """
@@ -153,7 +153,7 @@ class Realisation:
 
 
 def measure(truth: Truth, noise: Noise, seed: int, standard_start: bool) -> Realisation:
-    """Correlate images with n and with -n."""
+    """Correlate images with noise n and with -n."""
     ansatz = truth.ansatz
     levels = CorrelationOptions().levels if standard_start else (FULL,)
     options = CorrelationOptions(levels, gradient=noise.gradient, gradient_blur_px=noise.blur_px)
@@ -174,7 +174,7 @@ def measure(truth: Truth, noise: Noise, seed: int, standard_start: bool) -> Real
 
 
 def assess(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisation]) -> PairedErrors:
-    """Errors, what each result predicts of them, and the bound."""
+    """Errors of a quantity, the standard deviations that results predict, and the bound."""
     true = quantity.of(truth.a)
 
     def of_all(value: Callable[[Result], FloatArray]) -> FloatArray:
@@ -188,7 +188,7 @@ def assess(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisatio
 
 
 def chi_square(truth: Truth, made: list[Realisation]) -> Estimate:
-    """Mean square of the unknowns' errors, standardised by the bound with its correlations."""
+    """Mean square of the unknowns' errors, standardised by the bound's full covariance."""
     n = truth.ansatz.size
     distance = []
     for one in made:
@@ -199,7 +199,7 @@ def chi_square(truth: Truth, made: list[Realisation]) -> Estimate:
 
 
 def study(pairs: int, standard_start: bool, only: str) -> dict[str, Any]:
-    """All rows whose names begin with a text."""
+    """Measure all rows whose names begin with ``only``; their numbers as for JSON."""
     truth = Truth.default()
     parts = quantities(truth)
     rows: dict[str, Any] = {}

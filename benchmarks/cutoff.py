@@ -1,9 +1,9 @@
-"""The cut-off wavelength of the whole displacement, found from images, against the best one.
+"""Cut-off wavelength of the whole displacement: the one found from images, and the best one.
 
-Specimens of three kinds, two resolutions, 8-bit images and such with 1 and 2 % of noise, speckles
-of 4, 8 and 12 px: the rms error with the cut-off wavelength that is found, over the least one of
-any that is tried (steps of 1.4, until the error rises on both sides). Every measurement starts at
-the best fit of the ansatz, so that fine speckle beside a large w is not the question here.
+Specimens of three kinds, two pixel sizes, 8-bit images and images with 1 and 2 % of noise, speckles
+of 4, 8 and 12 px: the rms error with the cut-off wavelength that is found, the least error of any
+tried (steps of 1.4, until it rises on both sides), and their ratio. The start is the best fit of
+the ansatz, not a correlation. Table: docs/explanation/whole_field_speckle.md.
 
 Run: scripts/env python benchmarks/cutoff.py [--noise 0 0.01 0.02] [--speckle 4 8 12]
      [--pixel 0.01 0.02] [--json FILE]
@@ -46,7 +46,7 @@ STEP = 1.4
 
 @dataclass(frozen=True)
 class Row:
-    """Errors are rms per component over all material [px]."""
+    """Numbers of one case; errors are rms per component over all material [px]."""
 
     specimen: str
     pixel_mm: float
@@ -80,7 +80,7 @@ def main() -> None:
 def cases(
     pixels: Sequence[float], speckles: Sequence[float], noises: Sequence[float]
 ) -> Iterator[tuple[str, float, float, float, ImagePair]]:
-    """Specimen, pixel [mm], speckle's width [px] and noise, with the images."""
+    """Name of the specimen, pixel [mm], size of the speckle [px], noise [of full scale], images."""
     for name, (specimen, strain) in SPECIMENS.items():
         solution = simulate(Experiment(specimen, strains=(strain,), mesh_size=0.25))
         for pixel, width in product(pixels, speckles):
@@ -118,7 +118,7 @@ def found(pair: ImagePair, specimen: Specimen, name: str, noise: float, width: f
 
 
 def neighbours(tried: dict[int, float]) -> tuple[int, int]:
-    """Of the exponent with the least error."""
+    """Exponents beside that of the least error, in steps of the cut-off wavelength."""
     best = min(tried, key=lambda k: tried[k])
     return best - 1, best + 1
 

@@ -1,11 +1,11 @@
-"""Time and memory of the whole demo, stage by stage: ``python benchmarks/demo.py``.
+"""Time and memory of ``modeharvest run paper-virtual``, stage by stage, and of the demo.
 
-Runs ``modeharvest run paper-virtual`` twice in processes of its own: with all to be compiled, as on
-a new machine (numba's kernels and dolfinx' forms), and with it cached. "other" is what lies between
-the stages: Python's start, and waiting for the kernels that children compile while the finite
-elements run. Seconds are this machine's; the shares of the stages and the peak memory (of the
-largest process) carry over. The lines before are what ``modeharvest --help`` takes, the
-best of five, and what ``modeharvest demo`` takes: thrice with all to be compiled, and again.
+``python benchmarks/demo.py`` (two minutes) runs the case twice in new processes: first with all to
+be compiled, as on a new machine (numba's kernels and dolfinx' forms), then with it cached. "other"
+is the time outside of the stages: Python's start, and the wait for kernels that children compile
+during the finite elements. Seconds depend on the machine; shares of stages and peak memory (of the
+largest process) hardly do. Printed before are the best of five times of ``modeharvest --help``, and
+four of ``modeharvest demo``, of which the last is cached. Table: docs/explanation/speed.md.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ COMMAND = [sys.executable, "-m", "modeharvest"]
 
 
 def timed(*arguments: str, environment: Mapping[str, str]) -> tuple[float, float]:
-    """Seconds on the clock and on all processors that a command takes."""
+    """Wall-clock time and time of all processors that a command takes [s]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()
     subprocess.run([*COMMAND, *arguments], env=environment, check=True, capture_output=True)

@@ -1,18 +1,18 @@
-"""Whether a test's design foretells what its images then show.
+"""Errors that a test's design predicts, compared with those of simulated images.
 
-Three setups of the paper's case, far apart: images are made and exposed, correlated under several
-draws of the sensor's noise, and the scatter of what is found, and the standard deviations that the
-results report, are set against the design's, which has seen no image. Once with the displacement
-that the ansatz has of the simulated state, so that noise is all there is, and once with the
-simulated displacement itself, whose model error w lowers the curvature of the cost. What w itself
-does is how far v1 is off without noise, beside the best fit.
+For three very different setups of the paper's case, images are made, exposed and correlated under
+several draws of the sensor's noise. The scatter of the results, and the standard deviations that
+they report, are divided by the design's predictions, which use no image. The displacement is the
+ansatz's best fit to the simulated one, so that noise is the only error, or the simulated one, whose
+model error w lowers the curvature of the cost. The error of v1 without noise is the effect of w
+itself.
 
-With --strains the test is simulated at four strains beyond buckling, and the errors by these states
-are set against those that the design has from the last one by the root law of a pitchfork.
+With --strains the test is simulated at four strains beyond buckling. Errors predicted with these
+states are divided by those that the root law of a pitchfork extrapolates from the last one.
 
-With --parameters the material and the tilt of a small specimen, of the benchmark of identification,
-are identified from images and forces under draws of the noise at three setups, by the model that
-the data are of: scatter and reported standard deviations over the design's.
+With --parameters the material and tilt of a small specimen (identification_statistics.py) are
+identified at three setups from images and forces, with the model that made the data. Scatter and
+reported standard deviations are over the predicted ones. Tables: docs/how-to/design.md.
 
 Run: scripts/env python benchmarks/design.py [--seeds 30] [--json FILE] [--strains | --parameters]
 """
@@ -59,7 +59,7 @@ PARTS = "u", "v1", "wave numbers", "phases"
 
 
 def exposed(pair: ImagePair, design: Design, setup: DesignSetup, seed: int) -> ImagePair:
-    """The mean of some exposures of either image."""
+    """The mean of the setup's number of exposures, of either image."""
     bits, sensor = design.imaging.bits, design.imaging.sensor
     sensor = replace(sensor, read_noise=setup.noise, shot_seed=seed, read_seed=seed)
     f, g = (
@@ -71,7 +71,7 @@ def exposed(pair: ImagePair, design: Design, setup: DesignSetup, seed: int) -> I
 
 
 def sensitivities(design: Design, setup: DesignSetup) -> dict[str, FloatArray]:
-    """(..., n) derivatives of what is compared: u and v1 at points, and the modes' parameters."""
+    """(..., n) derivatives of u and v1 at points, of wave numbers and of phases by the unknowns."""
     state = design.state(setup)
     ansatz, a = state.ansatz, state.unknowns
     at = design.points[design.used(0.0)][::16]
@@ -92,11 +92,11 @@ def root_mean(values: FloatArray) -> float:
 
 
 def compared(design: Design, setup: DesignSetup, solution: Solution, seeds: int) -> dict[str, Any]:
-    """Scatter and reported standard deviations of some correlations, over the design's."""
+    """Scatter and reported standard deviations of ``seeds`` correlations, over the design's."""
     imaging, state = design.imaging, design.state(setup)
     spec, _ = design.speckle(setup)
     imaging = replace(imaging, pixel_size=setup.pixel_size, speckle=spec)
-    # Light without noise and gain: irradiance; the aperture is the sensor's.
+    # Images of the irradiance, without noise and gain, through the sensor's aperture.
     plain = Sensor(imaging.sensor.fill_factor, imaging.sensor.psf_px)
     with tempfile.TemporaryDirectory() as folder:
         made = make_images(solution, replace(imaging, sensor=plain), Path(folder), (STRAIN,))
@@ -119,7 +119,7 @@ def compared(design: Design, setup: DesignSetup, solution: Solution, seeds: int)
         scatter = np.sqrt(np.sum((deviations @ S.reshape(-1, S.shape[-1]).T) ** 2, axis=0))
         scatter /= np.sqrt(seeds - 1)
         predicted = propagated_sd(S, bound).ravel()
-        # Alike for fields, each by its own for parameters, whose sizes differ.
+        # Equal weights for fields; for parameters, whose sizes differ, their own sd.
         weight = 1.0 / predicted if S.ndim == 2 and name != "v1" else np.ones_like(predicted)
         named_sd = propagated_sd(S, reported).ravel()
         rows[name] = {
@@ -137,7 +137,7 @@ def compared(design: Design, setup: DesignSetup, solution: Solution, seeds: int)
 
 
 def other_strains(case: Case) -> None:
-    """Print the errors of simulated states over those of the design's root law."""
+    """Print errors predicted with simulated states, over those of the design's root law."""
     from modeharvest.fem.simulate import simulate
 
     strains = DesignOptions().ranges.strain
@@ -166,7 +166,7 @@ PARAMETER_SETUPS = {
         0.01, {"pixel_size": 0.05, "noise": 0.02, "exposures": 4},
     ),
 }  # fmt: skip
-"""Noise of the load cell [N/mm], and what differs from the defaults."""
+"""Noise of the load cell [N/mm], and changes of the design's setup."""
 
 
 def of_parameters(seeds: int) -> None:

@@ -1,8 +1,8 @@
-"""Optical distortion at the paper's image size: calibrated, recovered from a pair, taken out.
+"""Optical distortion at the paper's image size: calibration, recovery from a pair, removal.
 
-The truth is known: an analytic speckle seen through the exact inverse of a lens whose S reaches
-15 px, 8 bits and a noise of 1 % of full scale. Two lenses: a polynomial, and OpenCV's camera
-model, which no polynomial is exactly.
+The true lens is known: an analytic speckle is seen through the exact inverse of a distortion S of
+up to 15 px, with 8 bits and noise of 1 % of full scale. One lens is a polynomial, the other
+OpenCV's camera, which no polynomial matches exactly. Tables: docs/how-to/distortion.md.
 
 Run: scripts/env python benchmarks/distortion.py
      scripts/env python benchmarks/distortion.py LENS_PAIR_FOLDER
@@ -43,7 +43,7 @@ TURNS_RAD = np.array([0.0, 1e-4, -2e-4, 0.0, 1e-4, 0.0])
 
 
 def polynomial_lens(size_px: float) -> PolynomialDistortion:
-    """A random one of degree 5 without affine part."""
+    """A random polynomial of degree 5 without affine part; the largest S is ``size_px``."""
     rng = np.random.default_rng(0)
     i, j = np.array(PolynomialDistortion.orders(5)).T
     c = rng.uniform(-1, 1, (2, i.size)) / (1 + i**2 + j**2)
@@ -53,7 +53,7 @@ def polynomial_lens(size_px: float) -> PolynomialDistortion:
 
 
 def camera_lens(size_px: float) -> CameraDistortion:
-    """Barrel and tangential, off centre."""
+    """A camera with barrel and tangential distortion, off centre; the largest S is ``size_px``."""
 
     def lens(scale: float) -> CameraDistortion:
         return CameraDistortion(
@@ -64,13 +64,13 @@ def camera_lens(size_px: float) -> CameraDistortion:
 
 
 def lines(n: int) -> tuple[FloatArray, FloatArray]:
-    """Open grid over the image."""
+    """Rows (n, 1) and columns (1, n) of a grid over the image [px]."""
     rows, cols = (np.linspace(0.0, size - 1.0, n) for size in SHAPE)
     return rows[:, None], cols[None, :]
 
 
 def photographs(lens: Distortion) -> list[NDArray[np.float32]]:
-    """Exposures of a moved target, 8 bits."""
+    """Photographs of a target that is shifted and turned, 8 bits, as [0 ... 1]."""
     margin = 320
     target = Speckle(SpeckleSpec(seed=5), (SHAPE[0] + 2 * margin, SHAPE[1] + 2 * margin))
     ideal = lens.ideal(*np.indices(SHAPE, dtype=np.float64))

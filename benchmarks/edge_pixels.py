@@ -1,7 +1,7 @@
-"""How many pixels to leave out along the edges of holes: ``python benchmarks/edge_pixels.py``.
+"""Pixels left out along edges of holes, and accuracy: ``python benchmarks/edge_pixels.py``.
 
-On the paper's case after buckling (the shipped solution), for each ``edge_px``: pixels used, and
-the rms distance of IDIC from the best possible fit of the same ansatz to the truth.
+On the paper's case after buckling (shipped solution), for each ``edge_px``: pixels used, and rms
+distance of IDIC from the best fit of its ansatz to the truth (docs/decisions/0003-errors.md).
 """
 
 from __future__ import annotations

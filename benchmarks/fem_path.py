@@ -1,9 +1,9 @@
-"""The finite-element path beside a naive loop on the same case; its mesh convergence and cost.
+"""The finite-element path compared with a simple load loop; its mesh convergence and cost.
 
-``scripts/env python benchmarks/fem_path.py`` prints, for the 6 x 10 and the 12 x 10 specimen, what
-``simulate`` and the naive loop find, and what they cost in processor time. ``--table`` prints the
-tables of docs/explanation/fem.md instead, ``--ranks`` how much faster two MPI ranks are than one.
-Seconds depend on the machine; the ratios, of runs right after one another, hardly do.
+``scripts/env python benchmarks/fem_path.py`` prints, for the 6 x 10 and the 12 x 10 specimen, the
+results of ``simulate`` and of the loop, and their processor times. ``--table`` prints mesh
+convergence and cost instead, ``--ranks SIZE`` the speed-up by a second MPI rank. Seconds depend on
+the machine; ratios of successive runs hardly depend on it. Tables: docs/explanation/fem.md.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ CASES = {"6 x 10": Experiment(), "12 x 10": Experiment(Specimen(12, 10), strains
 
 
 class NaiveLoop:
-    """What a careful user of dolfinx would write in an afternoon, for the default loading.
+    """A simple load loop as a user of dolfinx might write it, for the default loading.
 
-    Steps of strain from zero; Newton's method with a factorisation in every iteration, started
-    from the state before; the number of negative pivots of one more factor at each equilibrium;
-    bisection between the last stable state and the first unstable one; a push along the
-    softest mode, by inverse iteration, and five steps to the last strain on the branch. MUMPS keeps
-    its analysis from one factorisation to the next. It knows nothing of rates, modes or
-    interpolation, and neither follows the unstable path nor computes eigenvalues.
+    Strain rises in steps from zero. Newton's method factorises in every iteration, and starts at
+    the state before; one more factor at each equilibrium gives the number of negative pivots.
+    Bisection between the last stable and the first unstable state gives the critical strain. A push
+    along the softest mode, found by inverse iteration, and five steps lead to the last strain on
+    the branch. MUMPS keeps its analysis. The loop uses no rates, modes or interpolation, and
+    neither follows the unstable path nor computes eigenvalues.
     """
 
     increment, tolerance = 0.01, 1e-7  # of strain
@@ -101,7 +101,7 @@ class NaiveLoop:
         return 0.5 * (low + high), float(dolfinx.fem.assemble_scalar(self.energy))
 
     def equilibrium(self, strain: float) -> int:
-        """Newton's method at a strain; the number of negative pivots there."""
+        """Find equilibrium at a strain by Newton's method; returns the negative pivots there."""
         values, change = self.u.x.array, self.change.x.array
         change[self.ends] = np.concatenate([strain * self.pushed, 0.0 * self.pushed])
         change[self.ends] -= values[self.ends]
@@ -113,9 +113,9 @@ class NaiveLoop:
         raise ArithmeticError(f"no equilibrium at a strain of {strain}")
 
     def newton_step(self, lifting: Any = None) -> float:
-        """Assemble, factorise, solve; the norm of the residual before."""
+        """Assemble, factorise, solve; returns the norm of the residual before the step."""
         dolfinx_api.assemble_vector(self.forces, self.b)
-        if lifting is not None:  # what moving the ends does to the others
+        if lifting is not None:  # forces by the motion of the ends
             dolfinx_api.assemble_vector(lifting, self.step)
             self.b.axpy(1.0, self.step)
         self.b.array[self.ends] = 0.0
@@ -126,14 +126,14 @@ class NaiveLoop:
         return size
 
     def factorise(self) -> None:
-        """Assemble and factorise the tangent; its ordering is kept from the first time."""
+        """Assemble and factorise the tangent; the ordering is that of the first time."""
         dolfinx_api.assemble_matrix(self.stiffness, self.bcs, 1.0, self.K)
         self.K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.pc.setUp()
         self.factorisations += 1
 
     def softest(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The mode nearest to zero, by inverse iteration, with a largest component of 1."""
+        """Mode of the eigenvalue nearest to zero, by inverse iteration; largest component 1."""
         mode = self.b.duplicate()
         mode.array[:] = np.random.default_rng(1).normal(size=len(mode.array))
         mode.array[self.ends] = 0.0
@@ -144,14 +144,14 @@ class NaiveLoop:
 
 
 def processor(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What the work gives, and its processor time [s]."""
+    """The result of some work, and its processor time [s]."""
     start = time.process_time()
     result = work()
     return result, time.process_time() - start
 
 
 def compare(name: str, experiment: Experiment) -> str:
-    """One row: both ways on one case, forms compiled beforehand."""
+    """One row of the table: both methods on one case, with forms compiled beforehand."""
     NaiveLoop(experiment)
     solution, ours = processor(lambda: simulate(experiment))
 
@@ -171,7 +171,7 @@ def compare(name: str, experiment: Experiment) -> str:
 
 
 def row(name: str, material: Material, size: float) -> str:
-    """One row of mesh convergence: the 6 x 10 specimen through both snapshots."""
+    """One row of the table of mesh convergence: the 6 x 10 specimen, up to its second snapshot."""
     solution, seconds = processor(lambda: simulate(Experiment(material=material, mesh_size=size)))
     info = solution.info
     critical = info["critical"]
@@ -183,14 +183,14 @@ def row(name: str, material: Material, size: float) -> str:
 
 
 def wall(ranks: int, size: float) -> tuple[float, str]:
-    """Wall time of ``simulate`` on some ranks [s], after their start, and the critical strain."""
+    """Wall-clock time of ``simulate`` on some ranks, without their start [s]; critical strain."""
     command = ["mpirun", "-n", str(ranks), sys.executable, __file__, "--one", str(size)]
     message = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
     return float(message[0]), message[1]
 
 
 def one(size: float) -> None:
-    """The default experiment on all ranks: prints seconds and critical strain."""
+    """Simulate the default experiment on all ranks; print seconds and critical strain."""
     MPI.COMM_WORLD.barrier()
     start = time.perf_counter()
     solution: Solution = simulate(Experiment(mesh_size=size))

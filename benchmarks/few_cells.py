@@ -1,12 +1,12 @@
-"""The mode of the best fit to a known displacement, when few cells are in view.
+"""Errors of the mode in the best fit to a known displacement, when few cells are in view.
 
 ::
 
     scripts/env python benchmarks/few_cells.py
 
-The shipped specimen at 12.8 %, cells around its middle: the ansatz is fitted to the true
-displacement of their material, at points 0.05 mm apart. There are no images: what is off is the
-ansatz'. By degrees of v0 and v1: how far the wave vectors, and a1, are from the lattice's [%].
+The ansatz is fitted to the true displacement of the shipped specimen at 12.8 %, at points 0.05 mm
+apart in cells around its middle. No images are used, so errors are those of the ansatz. Printed
+are those of wave vectors and of a1 [%], by degrees of v0 and v1. Table: docs/explanation/idic.md.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main() -> None:
     heads = [f"{v0}, {v}" for v0, v in DEGREES]
     print(f"| cells | {' | '.join(heads)} | as lowered |\n|---{'|---' * 4}|")
     for cells in VIEWS:
-        # An odd number of cells of an even one is half a cell beside the middle.
+        # If only one of both numbers is odd, the cells are half a cell beside the middle.
         of = np.array([specimen.holes_x, specimen.holes_y])
         centre, half = 0.5 * cell * ((of - cells) % 2), 0.5 * cell * np.array(cells)
         low, high = centre - half, centre + half

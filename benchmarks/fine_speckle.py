@@ -1,13 +1,13 @@
-"""Photographs whose speckle is fine beside a large w: with and without the whole displacement.
+"""Harvests of photographs with fine speckle and large w, with and without whole displacement.
 
-The paper's virtual specimen is photographed at 10 µm/px with its speckle made finer, by the factors
-given (1: 12 px wide), and with the camera's noise; and the photographs are harvested twice. Of each
-it says how the correlation ended, and how far its result is from the best fit of its ansatz; with
-the whole displacement also how far the refitted ansatz is from the best fit and the whole
-displacement from the truth, all in px, rms per component; and where it started.
+The paper's virtual specimen is photographed at 10 µm/px with the camera's noise and a speckle made
+finer by the factors given (1: 12 px wide), and harvested twice. Printed are the outcome of the
+correlation, its distance from the best fit of its ansatz and, with the whole displacement, the
+distances of the refitted ansatz from the best fit and of the whole displacement from the truth, in
+px rms per component, and where it started. Table: docs/explanation/whole_field_speckle.md.
 
 Run: scripts/env python benchmarks/fine_speckle.py [--size 1 0.7 0.5 0.33] [--noise 0.01]
-     [--strains 0.078 0.128] [--out out/fine_speckle]
+     [--strains 0.078 0.128] [--pixel 0.01] [--out out/fine_speckle]
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> None:
 def photographed(
     folder: Path, size: float, noise: float, pixel: float, strains: Sequence[float]
 ) -> ImageSet:
-    """The images with speckles of a size, and in ``folder/experiment`` what a user would have."""
+    """Make images with speckle ``size`` times as wide; a user's files in ``folder/experiment``."""
     case = Case.read("paper-virtual")
     speckle, shipped = case.imaging.speckle, shipped_solution("paper-virtual")
     assert shipped
@@ -77,7 +77,7 @@ def photographed(
 
 
 def compare(images: ImageSet, folder: Path, width: float, measure: bool) -> None:
-    """Harvest, and set the results against the truth."""
+    """Harvest the photographs, and compare the results with the truth."""
     case = PhotographCase.read(folder / "experiment/experiment.toml")
     case = case.model_copy(update={"whole_field": WholeFieldOptions(measure)})
     run = HarvestRun(case, folder / ("whole" if measure else "plain"))

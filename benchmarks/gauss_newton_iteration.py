@@ -1,10 +1,10 @@
-"""What a Gauss-Newton iteration costs, in samplings of the same pixels, and in images of memory.
+"""Cost of a Gauss-Newton iteration, in samplings of the same pixels; memory of a correlation.
 
-The paper's image size and 77 unknowns, on one thread in one process; every lap runs all
-contestants in turn and the medians of the processor's seconds are compared, so that the ratios
-mean something on a busy machine. The bound: 3 bicubic samplings of value and gradient by this
-package, tap after tap, which is the unit. An iteration samples value and gradient, assembles and
-solves the normal equations.
+An iteration samples value and gradient, assembles and solves the normal equations; here at the
+paper's image size, with 77 unknowns, on one thread. The unit of time is one bicubic sampling of
+value and gradient by this package, tap after tap; the bound is 3 units. All run alternately in one
+process, and medians of processor times are compared, so that ratios hold on a busy machine. Memory
+is in float32 images. Tables: docs/explanation/idic.md.
 
 Run: scripts/env python benchmarks/gauss_newton_iteration.py
 """
@@ -40,7 +40,7 @@ Work = Callable[[], object]
 
 
 def medians(contestants: dict[str, Work]) -> dict[str, float]:
-    """The processor's seconds of each, the median of some laps in turn after one that compiles."""
+    """Processor time of each [s]: the median of some alternate laps after one that compiles."""
     laps: dict[str, list[float]] = {name: [] for name in contestants}
     for repeat in range(REPEATS + 1):
         for name, work in contestants.items():
@@ -52,7 +52,7 @@ def medians(contestants: dict[str, Work]) -> dict[str, float]:
 
 
 def material() -> NDArray[np.bool_]:
-    """The paper's 6 x 10 holes."""
+    """(rows, cols) True on the material of the paper's specimen with 6 x 10 holes."""
     x, y = np.meshgrid(GRID.x, GRID.y)
     holes = np.hypot(x % 1.9 - 0.95, y % 1.9 - 0.95) < 0.75
     cellular = (abs(x) < 5.7) & (abs(y) < 9.5)
@@ -62,7 +62,7 @@ def material() -> NDArray[np.bool_]:
 def contestants(
     ansatz: Ansatz, f: Image, g: Image, mask: NDArray[np.bool_]
 ) -> tuple[dict[str, Work], int]:
-    """What to compare, and at how many pixels."""
+    """The calls that are compared, and the number of pixels that each samples."""
     a = ansatz.initial_guess(0.02)
     quintic, cubic = SplineImage.of(g, 5), SplineImage.of(g, 3)
     assembly = Assembly(ansatz, GRID, mask)
@@ -101,8 +101,8 @@ def contestants(
 
 
 def peak_memory(ansatz: Ansatz, f: Image, g: Image, mask: NDArray[np.bool_]) -> float:
-    """Most that a whole correlation allocates beside its input [float32 images of the size]."""
-    # The memory doesn't depend on how many iterations there are.
+    """Peak memory of a whole correlation beside its input [float32 images of this size]."""
+    # The memory doesn't depend on the number of iterations.
     options = CorrelationOptions(gauss_newton=GaussNewtonOptions(max_iterations=1))
     images = f.astype(np.float32), g.astype(np.float32)
     tracemalloc.start()

@@ -1,8 +1,8 @@
-"""Which gradient is best where the ansatz leaves a displacement over, and noise is beside it.
+"""Accuracy by the gradient that weights the residual, with model error and noise.
 
-The paper's case after buckling, 12.8 %, at 0.04 mm/px: the distance of the correlation from the
-best fit of the same ansatz to the true displacement, over noise in both images and over what
-weighs the residual.
+The paper's case after buckling, 12.8 %, at 0.04 mm/px: rms length of the distance of the
+correlation from the best fit of its ansatz to the truth [px], by the noise in both images and by
+the gradient. Half a minute of processor time. Table: docs/explanation/metrology.md.
 
 Run: scripts/env python benchmarks/gradient_choice.py [--seeds 3]
 """
@@ -38,7 +38,7 @@ WEIGHTED = {
 
 
 def images(folder: Path) -> ImageSet:
-    """Make the pair."""
+    """Make the pair of images."""
     path = shipped_solution("paper-virtual")
     if path is None:
         raise InputError("expected the shipped solution of paper-virtual, found none")
@@ -48,7 +48,7 @@ def images(folder: Path) -> ImageSet:
 
 
 def distances(pair: ImageSet, seeds: int) -> Iterator[tuple[float, str, float]]:
-    """Noise, what weighs, and the mean distance from the best fit over the seeds [px]."""
+    """Noise, name of the gradient, mean rms length of the distance from the best fit [px]."""
     case = Case.read("paper-virtual")
     ansatz = case.correlation.ansatz(case.experiment.specimen)
     start, grid = ansatz.initial_guess(STRAIN, case.correlation.start_amplitude), pair.grid

@@ -1,12 +1,12 @@
-"""Holes of other shapes than round ones, measured by their contours.
+"""Displacement from contours, for holes of various shapes.
 
 ::
 
     scripts/env python benchmarks/hole_shapes.py [--pixel-size 0.03] [--strain 0.06]
 
-A plate of 3 x 3 holes, clamped at its left and right edge and pressed, an Ogden material of
-exponent 3. Its holes are round, elliptical in turn, dimpled (four dents), notched (two slits), or
-of three sizes. Photographs as in contours.py, with noise of 1 %.
+A plate with 3 x 3 holes (Ogden law, exponent 3), clamped left and right and compressed; holes are
+round, elliptical (along x and y in turn), dimpled (four dents), notched (two slits) or of three
+sizes. Photographs as in contours.py, 1 % noise. Table: docs/explanation/contours.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from modeharvest.fem.sparse_factor import factorise
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.system import Imbalance
-from modeharvest.idic.photograph.plain import displacement_of_plain, plain_surface
+from modeharvest.idic.photograph.plain.measure import displacement_of_plain
+from modeharvest.idic.photograph.plain.surface import plain_surface
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.photographs.files import read_image
@@ -35,13 +36,13 @@ from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 PITCH, HALF, FINE = 1.9, 3.4, 0.01
-"""Of the holes, half of the plate's side, pixel of the mask that is meshed [mm]."""
+"""Pitch of the holes, half the plate's side, pixel of the mask that is meshed [mm]."""
 Hole = Callable[[FloatArray, FloatArray, int], BoolArray]
-"""From points around a hole's centre [mm] and its number to whether they are in it."""
+"""Whether points (x, y) from a hole's centre [mm] are inside; the last argument is its number."""
 
 
 def dimpled(x: FloatArray, y: FloatArray, _: int) -> BoolArray:
-    """Four dents of 0.08 mm."""
+    """A radius of 0.68 mm with four dents: it varies by 0.08 mm both ways."""
     return np.asarray(np.hypot(x, y) < 0.68 + 0.08 * np.cos(4.0 * np.arctan2(y, x)))
 
 
@@ -62,7 +63,7 @@ SHAPES: dict[str, Hole] = {
 
 
 def plate(hole: Hole) -> Mesh:
-    """A plate with 3 x 3 holes."""
+    """Mesh of a plate with 3 x 3 holes."""
     count = round(2.0 * (HALF + 0.3) / FINE)
     grid = PixelGrid.centred(count, count, FINE)
     x, y = np.meshgrid(grid.x, grid.y)
@@ -73,14 +74,14 @@ def plate(hole: Hole) -> Mesh:
 
 
 def pressed(mesh: Mesh, strain: float, steps: int = 4) -> FloatArray:
-    """(n, 2) displacement [mm] of a plate whose left and right edges are moved together."""
+    """(n, 2) displacement [mm] of a plate whose left and right edges approach each other."""
     law = Imbalance(mesh, Ogden(), np.zeros(len(mesh.nodes), dtype=np.bool_))
     x = mesh.nodes[:, 0]
     clamped = (x < x.min() + 2.0 * FINE) | (x > x.max() - 2.0 * FINE)
     free = np.repeat(~clamped, 2)
     u = np.column_stack([-strain / steps * x, 0.0 * x])
     for step in range(1, steps + 1):
-        new = u * step / max(1, step - 1)  # on from where the last one leads, clamped edges exactly
+        new = u * step / max(1, step - 1)  # extrapolated; exact at clamped edges
         for _ in range(12):
             f, K = law.forces(new.ravel())
             if np.abs(f[free]).max() < 1e-9:

@@ -1,22 +1,22 @@
-"""Micromorphic homogenization against Bloch waves, direct simulations and an independent code.
+"""Micromorphic homogenization compared with Bloch waves, direct simulations and other code.
 
 ``scripts/env python benchmarks/homogenization.py [SECTION ...]`` prints tables of
-docs/explanation/homogenization_*.md, as Markdown:
+docs/explanation/homogenization_strips.md (``flower``: homogenization_triangular.md), as Markdown:
 
-- ``cell``: homogeneous patterns: critical strain and stress on the branch, against Bloch waves and
+- ``cell``: homogeneous patterns: critical strain, and stress on the branch, against Bloch waves and
   the branch of the periodic cell.
 - ``strips``: n cells between clamped plates, periodic sideways: direct simulations (mean of two
-  positions of the lattice against the plates), and homogenized ones with an analytic mode, the
-  critical Bloch mode, and the mode that is measured in the images of the case paper-homogenized.
-  ``--picture PNG`` draws the size effect.
+  positions of the lattice at the plates), and homogenized ones with an analytic mode, the critical
+  Bloch mode, and the mode measured in the images of the case paper-homogenized. ``--picture PNG``
+  draws the size effect.
 - ``flower``: three modes of triangular stacking under equibiaxial load, computed, analytic and
   measured in an image: all branches by energy, against those of the periodic cell.
-- ``loads``: sides, shear and bending of homogeneous bodies, against Bloch waves and a beam.
-- ``independence``: a strip of six cells with other macroscopic elements, points and RVE's elements.
+- ``loads``: homogeneous bodies by sides and shear, against Bloch waves; bending, against a beam.
+- ``independence``: a strip of six cells by macroscopic elements, their points and RVE's elements.
 
-What isn't said otherwise has square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material,
-elements of 0.2 mm. Specimens with bulk edges are in ``homogenized_specimens.py``, how they bow in
-``homogenized_bowing.py``.
+Unless stated otherwise: square stacking, pitch 1.9 mm, d = 1.5 mm, the default Ogden material,
+elements of 0.2 mm. ``homogenized_specimens.py`` is for specimens with bulk edges,
+``homogenized_bowing.py`` for their bowing.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def analytic(centre: tuple[float, float] = JUNCTION, size: float = SIZE) -> RVE:
 
 
 def spread(count: int) -> list[RVE]:
-    """Of as many positions of a lattice rule, as ``positions`` of a case has them."""
+    """RVEs at ``count`` positions of a lattice rule, as by the key ``positions`` of a case."""
     at = np.array(JUNCTION) + PITCH * spread_positions(count)
     return [analytic((float(x), float(y))) for x, y in at]
 
@@ -148,9 +148,9 @@ def cell() -> None:
 
 
 def strip_mesh(cells: int, is_cut: bool, size: float) -> Mesh:
-    """From the centres of one row of holes to those of the next, where u_y = 0 by symmetry.
+    """Mesh from the centres of one row of holes to those of the next, where u_y = 0 by symmetry.
 
-    Plates touch the lattice between holes or, ``is_cut``, cut through them.
+    Plates touch the lattice between holes or, with ``is_cut``, cut through holes.
     """
     quarter, half = quarter_cell(PITCH, DIAMETER, size), 0.5 * cells * PITCH
     columns = (
@@ -196,7 +196,7 @@ def homogenized_strip(
 
 @cache
 def measured() -> RVE:
-    """With the mode that the images of the shipped case show, snapped to the lattice."""
+    """RVE with the mode measured in the images of the shipped case, snapped to the lattice."""
     with tempfile.TemporaryDirectory() as folder:
         run = HomogenizationRun(HomogenizationCase.read("paper-homogenized"), Path(folder))
         run.virtual.fem()
@@ -213,16 +213,16 @@ STRESSES = (0.08, 0.1)
 
 
 def size_effect() -> dict[str, FloatArray]:
-    """Critical strain [-] and stresses [MPa] (n, 3) of strips, of each kind of prediction.
+    """Critical strain [-] and stresses [MPa] (n, 3) of strips, by kind of prediction.
 
-    Direct simulations are (n, 2, 3), for the lattice's two positions against the plates.
+    Those of direct simulations are (n, 2, 3), for the two positions of the lattice at the plates.
     """
     free = PlateLoading(sides="periodic", pattern_at_plates="free")
     one = HomogenizedBody.of_specimen(
         Specimen(2, 2, bulk_x=0, bulk_y=0), analytic(), free, divisions=(1, 1)
     )
     local = homogenize(one, STRESSES)
-    assert local.critical is not None  # with plates that hold F̄ alone, the same for every n
+    assert local.critical is not None  # plates prescribe F̄ alone: the same for every n
     first = local.critical.load, *(state.force / (2 * PITCH) for state in local.states)
     found: dict[str, FloatArray] = {"direct": np.array([
         [(e, *stresses) for e, stresses in (direct_strip(n, is_cut) for is_cut in (False, True))]
@@ -282,7 +282,7 @@ def draw_size_effect(found: dict[str, FloatArray], path: Path) -> None:
 
 
 HEXAGONAL = Specimen(7, 7, 1.28, 1.386, bulk_x=0.0, bulk_y=0.0, stacking="triangular")
-"""The lattice of the case hexagonal-lattice; 46 holes for the image that shows its modes."""
+"""The lattice of the case hexagonal-lattice; the image of its modes has 46 holes."""
 
 
 SOFT = TwoTermI1()
@@ -337,7 +337,7 @@ def flower() -> None:
 
 
 def measured_flower(modes: ModeSet, state: BranchState) -> list[ModeField]:
-    """phi_i as IDIC finds them in an image of the flower, snapped to the lattice."""
+    """Modes phi_i that IDIC measures in an image of the flower, snapped to the lattice."""
     cell = hexagonal(HEXAGONAL.pitch, HEXAGONAL.diameter, 0.2)
     centres = HEXAGONAL.hole_centres
     blocks = [MeshBlock(cell.mesh.nodes + at, cell.mesh.cells) for at in centres]
@@ -387,7 +387,7 @@ def loads() -> None:
         e = found.load if found else np.nan
         row(name, sides, f"{e:.6%}", f"{exact:.6%}", f"{e / exact - 1:.1e}")
 
-    D = LinearisedBody(body, 0.0, body.start).moduli[0]  # relaxed at rest
+    D = LinearisedBody(body, 0.0, body.start).moduli[0]  # relaxed moduli at rest
     modulus = D[0, 0] - D[0, 3] ** 2 / D[3, 3]
     head("pure bending of a beam at 0.1 % in the outer fibre", "energy [N]", "E b e² L / 3", "off")
     bent = PlateLoading(0.0, 0.0, 1.0, plates="sliding")
@@ -429,7 +429,7 @@ def independence() -> None:
 
 
 PICTURE: list[Path] = []
-"""Where to draw the size effect, if anywhere."""
+"""File of the picture of the size effect; empty for none."""
 
 
 SECTIONS: dict[str, Callable[[], None]] = {
@@ -441,7 +441,7 @@ SECTIONS: dict[str, Callable[[], None]] = {
 def run_sections(
     parser: argparse.ArgumentParser, sections: Mapping[str, Callable[[], None]], *extra: str
 ) -> None:
-    """Those that the command line names, by default all but ``extra``."""
+    """Run the sections that the command line names, by default all but ``extra``."""
     parser.formatter_class = argparse.RawTextHelpFormatter
     parser.add_argument("section", nargs="*", help=", ".join(sections))
     options = parser.parse_args()

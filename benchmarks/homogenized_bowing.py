@@ -1,16 +1,16 @@
-"""Where compressed specimens bow sideways, directly and homogenized, and why not at one strain.
+"""Sideways bowing of compressed specimens, direct and homogenized, and why strains differ.
 
-``scripts/env python benchmarks/homogenized_bowing.py [SECTION ...]`` prints tables of
-docs/explanation/homogenization_*.md, as Markdown:
+``scripts/env python benchmarks/homogenized_bowing.py [SECTION ...]`` prints the tables of
+docs/explanation/homogenization_bowing.md, as Markdown:
 
-- ``waves``: transverse waves along x of the infinite lattice, exact (Bloch) and of the homogenized
-  continuum: what gradients of shear cost, which only the lattice knows.
-- ``small``, ``large``: the 6 x 10 and the 12 x 10 specimen. Both are followed to where they bow,
-  which is located and proved by inertia, and on from there on the stable, bowed branch.
+- ``waves``: transverse waves along x, of the infinite lattice (Bloch) and of the homogenized
+  continuum. The difference is the stiffness against gradients of shear, which the latter lacks.
+- ``small``, ``large``: the 6 x 10 and the 12 x 10 specimen, followed to the point where they bow,
+  which is located and proved by inertia, and from there along the stable, bowed branch.
 
-The second mode that some rows have, phi_S, is what w does under shear: the mean over the lattice's
-translations of its derivative by F21 on the buckled branch at 10 %, such that v_S can't follow the
-shear of its place alone but has a gradient that costs. All sections take a quarter of an hour.
+Some rows have a second mode phi_S, the change of w by shear: the mean over the lattice's
+translations of its derivative by F21 on the buckled branch at 10 %. Its amplitude v_S can't follow
+the local shear freely, because its gradient costs energy. All sections take a quarter of an hour.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.specimen import Specimen
 
 SHEAR, SHEAR_STRAIN = 2, 0.1
-"""Number of F21 among the generalised strains, and where phi_S is taken [-]."""
+"""Index of F21 in the generalised strains; strain at which phi_S is computed [-]."""
 
 
 @cache
@@ -65,7 +65,7 @@ def lattice_states(strains: tuple[float, ...]) -> list[FloatArray]:
 
 @cache
 def with_shear() -> RVE:
-    """Two modes: the pattern, and phi_S, which is alike for both signs of the pattern."""
+    """RVE with two modes: the pattern, and phi_S, which is the same for either sign of it."""
     rve, (q,) = analytic(), lattice_states((SHEAR_STRAIN,))
     reduction, nodes = rve.cell.reduction, rve.cell.cell.mesh.nodes
     w = np.zeros(reduction.size)
@@ -86,7 +86,7 @@ def with_shear() -> RVE:
 
 
 def waves() -> None:
-    """Squared frequencies of slow transverse waves of half-wavelengths of 12, 6 and 4 cells."""
+    """Print squared frequencies of slow transverse waves, half-wavelengths 12, 6 and 4 cells."""
     counts = (12, 6, 4)
     what = "12 cells: lattice, over that; homogenized; with φ_S"
     head("state", "shear modulus over density [N/mm²]", what, "6 cells", "4 cells")
@@ -103,7 +103,7 @@ def waves() -> None:
 
 
 def lattice_wave(q: FloatArray, cells: int) -> float:
-    """Of a wave of half-wavelength ``cells``: its eigenvalue over k^2 [N/mm^2], by Bloch."""
+    """Eigenvalue over k^2 [N/mm^2] of a Bloch wave with a half-wavelength of ``cells`` cells."""
     rve, k = analytic(), np.pi / (cells * PITCH)
     u = rve.displacement(q, np.zeros(rve.cell.reduction.size)) + rve.equilibrium(q).fluctuation
     wave = (2 * PITCH * k, 0.0)
@@ -115,7 +115,7 @@ def lattice_wave(q: FloatArray, cells: int) -> float:
 
 
 def homogenized_wave(rve: RVE, q: FloatArray, cells: int) -> float:
-    """The same of the homogenized continuum, v and its gradient free to follow."""
+    """The same for the homogenized continuum, where v and its gradient are free."""
     k, m = np.pi / (cells * PITCH), rve.mode_count
     D = rve.equilibrium(np.concatenate([q[:5], np.zeros(3 * m - 1)])).moduli
     B = np.zeros((4 + 3 * m, 2 + m), dtype=np.complex128)
@@ -132,7 +132,7 @@ State = tuple[float, float, int]
 
 
 def direct(size: tuple[int, int], strains: Sequence[float]) -> tuple[float, float, list[State]]:
-    """Critical strain, strain where it bows, and the stable states."""
+    """Critical strain, strain of bowing and stable states of a direct simulation."""
     specimen = Specimen(*size)
     loading = EdgeCompression(specimen.half_size[0], specimen.length)
     structure = Structure(mesh_specimen(specimen, SIZE), MATERIAL, loading)
@@ -143,7 +143,7 @@ def direct(size: tuple[int, int], strains: Sequence[float]) -> tuple[float, floa
     assert first is not None
     states = follow_branch(follower, first, strains, 1, PITCH)
     bowed = next(k for k, state in enumerate(states) if state.negative_pivots)
-    high = follower.equilibrium(states[bowed].strain, states[bowed].u)  # its modes are needed
+    high = follower.equilibrium(states[bowed].strain, states[bowed].u)  # for its modes
     assert high is not None
     second = locate_critical(follower, states[bowed - 1], high)
     assert second is not None
@@ -177,13 +177,13 @@ def homogenized(
 
 
 Kind = tuple[str, Sequence[RVE], int, str]
-"""Name, RVEs at a point, macroscopic elements for two cells, v at the bulk along the sides."""
+"""Name, RVEs at a point, macroscopic elements per two cells, condition of v along the sides."""
 
 
 def specimen(
     size: tuple[int, int], strains: Sequence[float], shown: Sequence[float], kinds: Sequence[Kind]
 ) -> None:
-    """The table of one specimen; followed through ``strains``, ``shown`` at some of them."""
+    """Print the table of one specimen, followed through ``strains`` and printed at ``shown``."""
     name, at = f"{size[0]} x {size[1]}, stable states", [list(strains).index(e) for e in shown]
     head(name, "RVEs", "ε_c", "bows at", *(f"energy, force at {e:.1%}" for e in shown),
          "negative eigenvalues", "s")  # fmt: skip

@@ -1,24 +1,24 @@
-"""Homogenized specimens with bulk edges beside their direct simulations, and what they cost.
+"""Homogenized specimens with bulk edges compared with direct simulations; their cost.
 
-``scripts/env python benchmarks/homogenized_specimens.py [SECTION ...]`` prints tables of
-docs/explanation/homogenization_*.md, as Markdown:
+``scripts/env python benchmarks/homogenized_specimens.py [SECTION ...]`` prints, as Markdown, tables
+of the pages docs/explanation/homogenization_PAGE.md (PAGE in brackets):
 
-- ``specimen``: the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
-- ``choices``: what the RVE's centre, v at bulk edges and the mode's parameters do to the former.
-- ``positions``: means over positions of the RVE that are spread evenly over a cell, of strips and
-  specimens.
-- ``translations``: specimens whose lattice is moved against their bulk edges, and their mean.
-- ``edges``: what solid strips before the plates and along the sides are worth before buckling.
-- ``zones``: where the energy is that the homogenized 6 x 10 specimen has too much.
-- ``plates``: specimens with and without solid strips before the plates, at 8 to 11 %.
-- ``corrected``: specimens whose lattice has the extent that makes up for its edges' energy.
-- ``bent``: a specimen bent or sheared as it is compressed.
-- ``triangular``: a specimen of triangular stacking.
-- ``cost``: seconds and memory a linearisation and RVE, from 60 to 10 000 RVEs.
-- ``shipped``: processor time of the stages of the case paper-homogenized.
-- ``ranks``: seconds of the 6 x 10 specimen, for ``mpirun -n N`` before ``python``; not by default.
+- ``specimen`` (specimens): the 6 x 10 and the 12 x 10 specimen, direct and homogenized.
+- ``choices`` (specimens): effects of the RVE's centre, of v at bulk edges, of mode parameters.
+- ``positions`` (positions): strips and specimens by the mean over positions of the RVE, spread
+  evenly over a cell.
+- ``translations`` (edges): specimens whose lattice is moved within its bulk, and their mean.
+- ``edges`` (studies): energy by solid strips at plates and along sides, before buckling.
+- ``zones`` (edge_energy): where the homogenized 6 x 10 specimen has too much energy.
+- ``plates`` (plates): specimens with and without solid strips at the plates, at 8 to 11 %.
+- ``corrected`` (edge_energy): specimens whose lattice is extended to correct the edges' energy.
+- ``bent`` (triangular): a specimen bent or sheared while it is compressed.
+- ``triangular`` (triangular): a specimen of triangular stacking.
+- ``cost`` (strips): time and memory per linearisation and RVE, with 60 to 10 000 RVEs.
+- ``shipped`` (strips): processor time of the stages of the case paper-homogenized.
+- ``ranks`` (strips): seconds of the 6 x 10 specimen under ``mpirun -n N``; not by default.
 
-All as in ``homogenization.py``.
+Conditions are those of ``homogenization.py``.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def homogenized_specimen(
     points: int | None = None,
     **options: Any,
 ) -> tuple[Homogenized, HomogenizedBody, float]:
-    """What is found, of what, and in how many seconds."""
+    """Homogenize a specimen: the result, its body, and the wall-clock time [s]."""
     body = HomogenizedBody.of_specimen(
         Specimen(*size), rves, PlateLoading(**options), divisions=divisions, points=points
     )
@@ -103,7 +103,7 @@ def homogenized_specimen(
 
 
 def compared(values: list[float], exact: list[float]) -> list[str]:
-    """A critical strain, energies and a force, each with its difference."""
+    """A critical strain, energies and a force as text, each with its relative difference."""
     texts = [f"{values[0]:.3%}", *(f"{v:.5f}" for v in values[1:])]
     pairs = zip(texts, values, exact[: len(values)], strict=True)
     with_difference = [f"{t} ({v / e - 1:+.2%})" for t, v, e in pairs]
@@ -202,19 +202,19 @@ def positions() -> None:
 LOADS = {(6, 10): (0.128,), (12, 10): (0.09, 0.1, 0.11, 0.127)}
 """Nominal strains at which specimens are compared [-]; at the last one 12 x 10 is unstable."""
 PARTS = {(6, 10): (4, 6), (12, 10): (7, 6)}
-"""Their macroscopic elements, of which a quarter has half as many."""
+"""Macroscopic elements of the whole specimen; a quarter has half as many along x and y."""
 
 
 def half_cells(count: int, end: float, is_moved: bool) -> list[tuple[float, float]]:
-    """A hole's coordinate and the side of it, for all half cells between -end and end."""
+    """A hole's coordinate and its side (-1 or 1), for all half cells between -end and end."""
     at = PITCH * (np.arange(count + is_moved) + 0.5 * (not is_moved)) - end
     return [(float(x), s) for x in at for s in (-1.0, 1.0) if abs(x + 0.25 * s * PITCH) < end]
 
 
 def shifted_mesh(specimen: Specimen, shift: tuple[bool, bool], size: float = SIZE) -> Mesh:
-    """The same rectangle with its bulk, the lattice moved by half a cell along x, y or both.
+    """Mesh of a specimen and its bulk with the lattice moved by half a cell along x, y or both.
 
-    Where it is moved bulk edges cut holes in two, so that as much of it is material.
+    Bulk edges then cut holes in two, so that the amount of material stays the same.
     """
     half, gap = 0.5 * PITCH, 0.5 * (PITCH - DIAMETER)
     (a, b), (nx, ny) = specimen.cellular_half_size, (specimen.holes_x, specimen.holes_y)
@@ -224,7 +224,7 @@ def shifted_mesh(specimen: Specimen, shift: tuple[bool, bool], size: float = SIZ
     blocks = [quarter.placed((sx, sy), (x, y)) for x, sx in columns for y, sy in rows]
 
     def strip(width: float, is_cut: bool, along_x: bool) -> MeshBlock:
-        """Bulk beside half a cell, from its hole's centre at 0 to its corner at l / 2."""
+        """Bulk beside half a cell, from the hole's centre at 0 to the cell's corner at l / 2."""
         n, m = divisions_of(width, size), divisions_of(half, size)
         if not is_cut:
             return rectangle(width, half, n, m) if along_x else rectangle(half, width, m, n)
@@ -245,8 +245,8 @@ def shifted_mesh(specimen: Specimen, shift: tuple[bool, bool], size: float = SIZ
 
 
 def translations() -> None:
-    """Direct simulations of specimens whose lattice is moved against their bulk edges."""
-    # At strains at which all of them are stable.
+    """Print direct simulations of specimens whose lattice is moved within its bulk."""
+    # At the last strain all 12 x 10 specimens are stable, but not all 6 x 10 ones.
     for size, first, load in (((6, 10), 0.078, 0.128), ((12, 10), 0.082, 0.1)):
         name, specimen = f"{size[0]} x {size[1]}", Specimen(*size)
         head(name, "ε_c", f"energy at {first:.1%} [N]", f"energy at {load:.1%} [N]",
@@ -264,14 +264,14 @@ def translations() -> None:
                 critical = locate_critical(follower, path[-2], path[-1])
                 assert critical is not None
                 (state,) = follow_branch(follower, critical, [load], 1, PITCH)
-            else:  # its pattern has the specimen's own symmetries, and grows from the beginning
+            else:  # the pattern has the specimen's symmetries, and grows from the start
                 path, follower.linearisation = path[:1], None
                 follower.follow_primary(path, (first, load), refuse_unstable=True)
                 state = path[-1]
             before = next(s for s in path if abs(s.strain - first) < 1e-12)
             values = [structure.energy(before.u), structure.energy(state.u),
                       structure.reaction(state.u, specimen.length)]  # fmt: skip
-            if abs(state.strain - load) > 1e-12:  # unstable before
+            if abs(state.strain - load) > 1e-12:  # it became unstable before
                 values[1:] = [np.nan, np.nan]
             e = critical.strain if critical else np.nan
             found.append([e, *values])
@@ -295,13 +295,13 @@ def translations() -> None:
 
 
 EARLY = 0.01
-"""A strain at which patterns play no part [-]."""
+"""Nominal strain before buckling, at which there is no pattern [-]."""
 
 
 def edges() -> None:
-    """Energy that homogenized specimens of several sizes have too much, by their solid edges.
+    """Print the excess energy of homogenized specimens of several sizes, by their solid edges.
 
-    Of n x m cells it is e0 + e1 m + e2 n + e3 n m: of corners, plates, sides and the inside.
+    For n x m cells it is e0 + e1 m + e2 n + e3 n m: of corners, plates, sides and the inside.
     """
     sizes = ((6, 10), (12, 10), (12, 20), (24, 20))
     rve = RVE(supercell(), MATERIAL, [], JUNCTION)
@@ -338,7 +338,7 @@ ZONES = ("cells inside", "cells at the sides", "cells at the plates", "cells in 
 
 
 def energies_by_zone(specimen: Specimen, places: FloatArray, energy: FloatArray) -> FloatArray:
-    """(6,) sums of energies at places (n, 2) over ``ZONES``."""
+    """(6,) sums over ``ZONES`` of energies (n,) at places (n, 2) [mm]."""
     (x, y), (a, b) = np.abs(places).T, specimen.cellular_half_size
     at_plates, at_sides = x > a - PITCH, y > b - PITCH
     cells = np.where(at_sides, np.where(at_plates, 3, 1), np.where(at_plates, 2, 0))
@@ -347,7 +347,7 @@ def energies_by_zone(specimen: Specimen, places: FloatArray, energy: FloatArray)
 
 
 def zones() -> None:
-    """Where a homogenized specimen has more energy than the direct one."""
+    """Print where a homogenized specimen has more energy than the direct one."""
     loads, specimen = (0.04, 0.08, 0.1, 0.128), Specimen()
     direct = simulate(Experiment(specimen, strains=loads))
     at, exact = quadrature(direct.mesh, 3), []
@@ -375,7 +375,7 @@ STRAINS = (0.08, 0.09, 0.1, 0.11)
 
 
 def plates() -> None:
-    """Specimens with solid strips before the plates and without, by the choices that there are."""
+    """Print specimens with and without solid strips at the plates, by choices of the method."""
     at = (f"energy, force at {e:.0%}" for e in STRAINS)
     head("specimen", "strips [mm]", "homogenized", "RVEs", "ε_c", *at)
     quarter, free = {"quarter": True}, {"quarter": True, "pattern_at_bulk": "free"}
@@ -408,7 +408,7 @@ def plates() -> None:
 
 
 def corrected() -> None:
-    """Specimens whose lattice has the extent that makes up for its edges' energy."""
+    """Print specimens whose lattice is extended to correct the energy of its edges."""
     bare, loading = Specimen(bulk_x=0.0, bulk_y=0.0), PlateLoading(quarter=True)
     start = time.process_time()
     shifts = edge_shifts(Specimen(), MATERIAL, SIZE, loading)
@@ -447,7 +447,7 @@ def direct_row(
     title: str, strains: Sequence[float], states: Sequence[DirectState], seconds: float,
     critical: float | None = None,
 ) -> None:  # fmt: skip
-    """The head of a table, too."""
+    """Print the head of a table and its row of the direct simulation."""
     at = (f"energy, force at {e:.0%}" for e in strains)
     head(title, "RVEs", "ε_c", *at, "negative eigenvalues", "s")
     values = (f"{energy:.5f} N, {force:.5f} N/mm" for energy, force, _ in states)
@@ -459,7 +459,7 @@ def homogenized_row(
     name: str, body: HomogenizedBody, strains: Sequence[float], exact: Sequence[DirectState],
     critical: float | None = None, shortening: FloatArray | None = None,
 ) -> None:  # fmt: skip
-    """``shortening``: the rates of all unknowns that the direct simulation's force works on."""
+    """Print a row; ``shortening``: rates of all unknowns on which the direct force does work."""
     start, values = time.perf_counter(), list[str]()
     found = homogenize(body, strains)
     seconds = time.perf_counter() - start
@@ -477,11 +477,11 @@ def homogenized_row(
 
 
 SHEAR = 0.5
-"""Of plates, a unit of compression [-]."""
+"""Transverse displacement of the plates per unit of compression [-]."""
 
 
 class ShearedStructure(Structure):
-    """Plates that move across, too, as ``PlateLoading(shear=SHEAR)`` has them."""
+    """Plates that also move transversely, as with ``PlateLoading(shear=SHEAR)``."""
 
     def _constrain(self, loading: EdgeCompression) -> None:
         super()._constrain(loading)
@@ -529,7 +529,7 @@ def ranks() -> None:
 
 
 def tilted(body: HomogenizedBody, tilt: float) -> FloatArray:
-    """Turn the right plate, per unit of strain [rad]; the rates of all unknowns without that."""
+    """Turn the right plate by ``tilt`` per unit of strain [rad]; returns the rates without that."""
     shortening, nodes = body.direction.copy(), body.mesh.nodes
     right = np.flatnonzero(nodes[:, 0] > nodes[:, 0].max() - 1e-9)
     body.direction[right * (2 + body.mode_count)] -= tilt * nodes[right, 1]
@@ -601,7 +601,7 @@ def cost() -> None:
 
 
 def shipped() -> None:
-    """Processor time of the stages of the shipped case [s]."""
+    """Print the processor time of the stages of the shipped case [s]."""
     with tempfile.TemporaryDirectory() as folder:
         run = HomogenizationRun(HomogenizationCase.read("paper-homogenized"), Path(folder))
         virtual, seconds = run.virtual, []

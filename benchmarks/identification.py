@@ -1,14 +1,14 @@
-"""Edges and holes identified from images and forces, or ignored: errors, intervals, residual.
+"""Identification with imperfect edges and holes, unknown or ignored: errors, intervals, residual.
 
     scripts/env python benchmarks/identification.py edges --seeds 3
     scripts/env python benchmarks/identification.py holes --seeds 1
     scripts/env python benchmarks/identification.py ovals --seeds 1
 
-The specimen of ``identification_statistics.py``. ``holes``: those of the data are 2 % larger than
-the model's and scattered; they are ignored, all as large as they are on average, or each by itself.
-``ovals``: they are scattered and not round; taken for round, or each with its ovality.
-``edges``: the loaded edges of the data bow, slide and spread; they are ignored, unknown, or left to
-displacements of the ansatz beside the model's. Data, model and finer mesh have meshes of their own.
+The specimen of ``identification_statistics.py``. ``holes``: true holes are 2 % larger than the
+model's and scattered; they are ignored, given one diameter, or each unknown. ``ovals``: they are
+scattered and not round; taken as round, or with ovality. ``edges``: true loaded edges bow, slide
+and spread; this is ignored, unknown, or left to added displacements of the ansatz. Data, model and
+finer mesh have different meshes. Tables: docs/explanation/identification_supports.md.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ OVAL, ROUND = (
     [f"holes[{k}].{part}" for k in range(HOLES) for part in parts] for parts in (PARTS, PARTS[:3])
 )
 LARGEST = 3
-"""Degree of v0 and v1."""
+"""Largest total degree of v0 and v1."""
 TRUTHS: dict[str, dict[str, float]] = {
     "holes": {"holes.diameter[0,0]": 0.03,
               **dict(zip(ROUND, SCATTER.drawn(HOLES)[:, :3].ravel(), strict=True))},
@@ -73,8 +73,8 @@ MESHES = {
     "ovals": ((0.25, 3), (0.35, 3), (0.35, 4), 0.1),
     "edges": ((0.2, 4), (0.35, 3), (0.25, 4), 0.02),
 }
-"""Size [mm] and degree of elements of the data, of the model and of its finer mesh, and the ratio
-of the errors of these two. With more, no states of such scattered holes are found at 12 %."""
+"""Element size [mm] and degree of the data, of the model and of its finer mesh, and the ratio of
+the finer mesh's error to the model's. With finer ones no states of such holes are found at 12 %."""
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def by_unknowns(what: str, seeds: int) -> None:
-    """Print what is found where holes or edges are ignored or unknown."""
+    """Print the parameters identified with holes or edges ignored or unknown."""
     truth = {"tilt": 0.01, **TRUTHS[what]}
     of_data, of_model, of_finer, ratio = MESHES[what]
     finest = made(*of_data, tuple(truth))
@@ -128,7 +128,7 @@ def by_unknowns(what: str, seeds: int) -> None:
                 )  # fmt: skip
                 seconds = time.process_time() - begin
                 predicted = found.sd_with_model_error
-                if what != "edges":  # of all holes, rms
+                if what != "edges":  # rms over all holes
                     error = holes_of(names, found.values, coarse.experiment) - holes
                     parts = len(unknown) // HOLES
                     error, own = error[:, :parts], predicted[3:][: parts * HOLES]
@@ -154,7 +154,7 @@ def by_unknowns(what: str, seeds: int) -> None:
 def seen(
     test: ParametricTest, terms: list[Term], with_derivatives: bool, values: FloatArray
 ) -> list[ParametricState]:
-    """The model's states, with displacements of the ansatz beside them."""
+    """The model's states with displacements of the ansatz added."""
     own, added = np.split(values, [len(values) - len(terms)])
     states = test.near(own, with_derivatives)
     return with_terms(states, terms, added, test.mesh.nodes, SPECIMEN)

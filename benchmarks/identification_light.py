@@ -1,10 +1,10 @@
-"""How much an unknown light would widen the intervals of identified parameters.
+"""Effect of unknown illumination on the intervals of identified parameters.
 
-Before each level gain and offset of the light are found as polynomials over the image, and then
-kept: docs/how-to/identification.md, "Photographs". Here they are unknowns beside the parameters
-(a Schur complement of the joint normal matrix), for the two states of the benchmark of
-identification, with speckles of several widths: standard deviations with over those without, and
-how far parameters would be off by a light that is off by its own standard deviation.
+An identification finds gain and offset of the illumination before each level, as polynomials over
+the image, and then keeps them. Here they are unknowns beside the parameters (a Schur complement of
+the joint normal matrix), for the two states of identification_statistics.py and speckles of two
+sizes. Printed are standard deviations with them over those without, and errors of parameters by
+gain and offset that are off by one sd: see docs/how-to/identification.md, "Photographs".
 
 Run: scripts/env python benchmarks/identification_light.py
 """
@@ -19,9 +19,9 @@ from modeharvest.idic.finite_element.result import located, nodal_values
 from modeharvest.util.arrays import FloatArray
 
 PIXEL = 0.03
-"""[mm]."""
+"""Pixel size [mm]."""
 FORCE_SD = 0.003
-"""Of the load cell [N/mm]."""
+"""Standard deviation of the load cell [N/mm]."""
 
 
 def main() -> None:
@@ -51,14 +51,14 @@ def main() -> None:
 
 
 def light_of(points: FloatArray, grey: FloatArray, degree: int) -> FloatArray:
-    """(p, n) how grey levels change with gain and offset, polynomials of a degree."""
+    """(p, n) derivatives of grey levels by the coefficients of offset and gain, polynomials."""
     u, v = (points / np.abs(points).max(axis=0)).T
     smooth = [u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)]
     return np.array([*smooth, *(p * grey for p in smooth)]).T
 
 
 def row(states: list, seen: list, slopes: FloatArray, light: FloatArray, k: int) -> list[str]:  # type: ignore[type-arg]
-    """Ratios of standard deviations, and of what the light's own makes of parameters to them."""
+    """Ratios of standard deviations, and the largest error by the light over the sd without it."""
     n = light.shape[1]
     matrix = np.zeros((k + len(STRAINS) * n,) * 2)
     for number, (state, S) in enumerate(zip(states, seen, strict=True)):

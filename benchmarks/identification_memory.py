@@ -1,7 +1,7 @@
-"""What an identification takes: seconds, and memory by the part of the program that it is for.
+"""Time of an identification, and its memory by parts of the program.
 
-Runs a case in this process, as `modeharvest identify` does, while a thread looks twenty times a
-second at how much memory is resident and at which of some functions the program is in.
+Runs a case in this process, as `modeharvest identify` does. Twenty times a second a thread reads
+the resident memory and the active function (docs/explanation/identification_accuracy.md).
 
 Run: scripts/env python benchmarks/identification_memory.py [identify-paper] [--out FOLDER]
 """
@@ -24,11 +24,11 @@ PARTS = (
     "_make_twin", "_data", "joint_score", "omitted_terms", "_finished", "minimise",
     "_path_warnings", "write_page",
 )  # fmt: skip
-"""Functions whose memory is given apart; the innermost counts."""
+"""Functions whose memory is recorded separately; the innermost one counts."""
 
 
 def watched(thread: int, stop: threading.Event, most: dict[str, float]) -> None:
-    """Keep the largest resident memory [MiB] of each part that a thread is in."""
+    """Record the largest resident memory [MiB] of each part that ``thread`` runs."""
     process = psutil.Process()
     while not stop.wait(0.05):
         frame, part = sys._current_frames().get(thread), "the rest"

@@ -1,19 +1,19 @@
-"""Material and tilt identified from images and forces: bias, scatter and coverage over seeds, cost.
+"""Identification of material and tilt from images and forces: bias, scatter, coverage, cost.
 
     scripts/env python benchmarks/identification_statistics.py --seeds 100
         [--linear] [--seeds 12 --pixel-size 0.02 --compare] [--fields] [--cost]
 
-A small specimen with known parameters, simulated with polynomials of degree 4, is photographed once
-without noise; each seed adds noise to images and forces and identifies from values off by a factor
-of two, by a model on another mesh, of degree 3, whose last steps have the residual of a third mesh
-of degree 4. A dask campaign: what is stopped goes on. ``--linear``: from the true values, by
-states that are linear about them, which is a small part of the work. ``--compare``: also by
-updating the same model from displacements that were measured first, as the whole displacement
-(finite-element DIC without a law, started at the best fit of the ansatz) and by pyvale's subsets
-(MODEHARVEST_PYVALE names a Python that has it). ``--fields``: from exact displacements and forces
-of a fine mesh, by coarser ones: the error by the mesh. ``--cost``: what the model's states cost,
-with and without derivatives, along the whole path and from states nearby, of this specimen and of
-the paper's.
+A small specimen, simulated with polynomials of degree 4, is photographed once without noise. Each
+seed adds noise to images and forces, and identifies from values off by a factor of two (tilt from
+0), by a model of degree 3 on another mesh. The last steps use the residual of a third mesh of
+degree 4. It is a dask campaign, which continues where it was stopped. ``--linear`` starts from the
+true values, with states that are linear about them, in a small part of the time. ``--compare`` also
+updates the same model from displacements that were measured first: the whole displacement
+(finite-element DIC without a law, started at the best fit of the ansatz), and pyvale's subsets
+(MODEHARVEST_PYVALE names a Python that has it). ``--fields`` gives the error by the mesh: exact
+displacements and forces of a fine mesh are identified on coarser ones. ``--cost`` times states of
+the model with and without derivatives, on the whole path and from states nearby, also of the
+paper's specimen. Tables: docs/explanation/identification_accuracy.md, identification_compared.md.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ from modeharvest.validation.workers import Workers
 FUNCTION = "identification_statistics:one_seed"
 SPECIMEN = Specimen(4, 4, diameter=1.6, bulk_x=0.9, bulk_y=0.4)
 STRAINS = (0.06, 0.11)
-"""Beyond the second, edges of holes wrinkle: results go with the mesh."""
+"""Above the second strain edges of holes wrinkle, and results depend on the mesh."""
 TRUE = {"moduli[0]": 1.2, "exponents[0]": 3.0, "kappa": 5.4, "tilt": 0.01}
 UNKNOWNS = {
     "moduli[0]": Unknown(2.4, (0.1, 10.0)),
@@ -110,7 +110,7 @@ def main() -> None:
 def made(
     size: float, degree: int = 3, names: tuple[str, ...] = tuple(TRUE), last: float = STRAINS[-1]
 ) -> ParametricTest:
-    """The model with elements of a size [mm] and polynomials of a degree, to the last strain."""
+    """Model with elements of ``size`` [mm] and polynomials of ``degree``, up to the last strain."""
     experiment = Experiment(SPECIMEN, strains=(STRAINS[0], last), mesh_size=size)
     return ParametricTest.meshed(experiment, names, degree)
 
@@ -118,7 +118,7 @@ def made(
 def finer_mesh(
     size: float, mesh: float, linear_on: Mesh | None = None, last: float = STRAINS[-1]
 ) -> FinerMesh:
-    """What has the last word after elements of another size: of degree 4."""
+    """Mesh of degree 4 for the last steps, after elements of another size, ``mesh`` [mm]."""
     fine, ratio = made(size, 4, last=last), error_ratio(size / mesh)
     if linear_on is not None:
         return FinerMesh(linearised(fine, TRUTH, linear_on), ratio)
@@ -126,7 +126,7 @@ def finer_mesh(
 
 
 def linearised(test: ParametricTest, values: FloatArray, mesh: Mesh | None = None) -> Model:
-    """The states of values nearby, linear about these; on another mesh if it is given."""
+    """Model that is linear about ``values``; its states are on another mesh if that is given."""
     states = test.at(values)
     if mesh is not None:
         own, nodes = test.mesh, mesh.nodes
@@ -142,7 +142,7 @@ def linearised(test: ParametricTest, values: FloatArray, mesh: Mesh | None = Non
 
 
 def linear_about(values: FloatArray, states: list[ParametricState]) -> Model:
-    """The states of values nearby, by the derivatives of these."""
+    """Model that is linear about ``values``, whose states and derivatives are given."""
 
     def near(others: FloatArray) -> list[ParametricState]:
         by = others - values
@@ -155,11 +155,11 @@ def linear_about(values: FloatArray, states: list[ParametricState]) -> Model:
 
 
 def by_mesh(tilt: float, last: float) -> None:
-    """Print what models of several meshes make of the states of a fine one."""
+    """Print parameters that models of several meshes identify from exact states of a fine one."""
     fine, (x, y) = made(0.15, 4, last=last), np.mgrid[-4.7:4.7:0.06, -4.2:4.2:0.06].reshape(2, -1)
     states = fine.at(np.append(TRUTH[:3], tilt), False)
     points = np.column_stack([x, y])
-    hole = SPECIMEN.pitch * (np.round(points / SPECIMEN.pitch - 0.5) + 0.5)  # the nearest one
+    hole = SPECIMEN.pitch * (np.round(points / SPECIMEN.pitch - 0.5) + 0.5)  # the nearest
     points = points[np.linalg.norm(points - hole, axis=1) > 0.5 * SPECIMEN.diameter + 0.02]
     fields = [nodal_values(fine.mesh, s.displacement, points) for s in states]
     forces = Readings(np.array([s.force for s in states]), 0.002)
@@ -180,7 +180,7 @@ def by_mesh(tilt: float, last: float) -> None:
         )
         residual = 1e3 * found.state_equations[-1].residual
         least = least_stretch(found.states[-1])
-        # The last word itself, not what is extrapolated from it.
+        # Values of the finer mesh, without their extrapolation.
         row = (f"{v:.4g}" for v in (*(found.values - found.mesh_error), least, residual))
         seconds = time.process_time() - begin
         print("|", degree, "|", size, "|", finer or "", "|", " | ".join(row), "|",
@@ -188,13 +188,13 @@ def by_mesh(tilt: float, last: float) -> None:
 
 
 def least_stretch(state: ParametricState) -> float:
-    """Of all principal ones in the elements [-]."""
+    """Least principal stretch in the elements [-]."""
     F = np.eye(2) + element_gradients(state.mesh, state.displacement)
     return float(np.linalg.svd(F, compute_uv=False).min())
 
 
 def costs() -> None:
-    """Print processor time, the least [s] and ratios' median, and factorisations of states."""
+    """Print least processor times of states [s], medians of their ratios, and factorisations."""
     paper = Experiment(strains=(0.078, 0.11, 0.128), mesh_size=0.4)
     small = Experiment(SPECIMEN, strains=(0.06, 0.09, 0.12), mesh_size=0.35)
     names = ("moduli[0]", "exponents[0]", "kappa", "tilt", "travel")
@@ -206,7 +206,7 @@ def costs() -> None:
         model.at(true)
         for what, find in (("whole path", model.at), ("nearby", model.near)):
             times = np.empty((1 if find == model.at else 9, 2))
-            for pair in times:  # in turn: others work, too
+            for pair in times:  # alternately, for other load
                 for k, wanted in enumerate((False, True)):
                     find(true)
                     count, begin = model.structure.factorisations, time.process_time()
@@ -268,7 +268,7 @@ def row_of(done: pd.DataFrame, method: str, name: str, true: float) -> str:
 
 
 def make_twin(folder: Path, size: float, pixel_size: float) -> None:
-    """Images without noise, and exact forces, of the true test; once."""
+    """Make noise-free images and exact forces of the true test, unless they exist."""
     if (folder / "forces.json").exists():
         return
     twin = made(size, 4)
@@ -284,7 +284,7 @@ def make_twin(folder: Path, size: float, pixel_size: float) -> None:
 
 @dataclass(frozen=True)
 class Setting:
-    """What all seeds of a campaign have in common."""
+    """Data and models that all seeds of a campaign share."""
 
     images: ImageSet
     forces: FloatArray
@@ -297,7 +297,7 @@ class Setting:
 
 @cache
 def setting(twin: Path, mesh: float, finer: float, linear: bool) -> Setting:
-    """Made once in a worker."""
+    """Make the setting, once in each worker."""
     model = made(mesh)
     return Setting(
         ImageSet.read(twin), np.array(read_json(twin / "forces.json")), model.mesh,
@@ -308,7 +308,7 @@ def setting(twin: Path, mesh: float, finer: float, linear: bool) -> Setting:
 
 
 def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """What is identified from the images and readings of one seed, by each method."""
+    """Identify from the images and readings of one seed by each method; columns of the table."""
     known = setting(folder / case["twin"], case["mesh"], case["finer"], case["linear"])
     images, rng = known.images, np.random.default_rng(case["seed"])
     exact = (images.reference(), *(images.deformed(e) for e in STRAINS))
@@ -346,7 +346,7 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def observed(method: str, pairs: list[ImagePair], known: Setting) -> list[StateObservation]:
-    """What a method gives of each state: images, or displacements measured in them."""
+    """Data of each state for a method: images, or displacements measured in them."""
     if method == IMAGES:
         plain = (ImagePair(pair.reference, pair.deformed, pair.grid) for pair in pairs)
         return [ImageData(pair, known.pixels, ImageNoise(NOISE, NOISE)) for pair in plain]
@@ -355,7 +355,7 @@ def observed(method: str, pairs: list[ImagePair], known: Setting) -> list[StateO
 
 
 def whole(pair: ImagePair) -> tuple[FloatArray, FloatArray, float]:
-    """Nodes, whole displacement there, and its standard deviation by noise, rms [mm]."""
+    """Nodes, whole displacement there, and its rms standard deviation by noise [mm]."""
     assert pair.truth is not None
     ansatz = Ansatz.of_specimen(SPECIMEN, options=AnsatzOptions(4, 3))
     guess, u = ansatz.initial_guess(pair.strain), pair.truth.displacement
@@ -365,7 +365,7 @@ def whole(pair: ImagePair) -> tuple[FloatArray, FloatArray, float]:
 
 
 def by_subsets(pair: ImagePair) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The same by pyvale: subsets of material alone, weighted by their predicted errors."""
+    """The same by pyvale, from subsets of material alone, with predicted standard deviations."""
     field = subset_field(pair, SUBSET)
     assert field.sd is not None
     return np.stack([field.x, field.y], 1)[field.good], field.u[field.good], field.sd[field.good]

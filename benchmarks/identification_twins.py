@@ -1,15 +1,15 @@
-"""Material and tilt identified through a lens from painted specimens whose holes are scattered.
+"""Identification of material and tilt through a lens, with scattered holes and painted dots.
 
     scripts/env python benchmarks/identification_twins.py --seeds 100 [--holes hidden | --whole]
 
 The specimen of ``identification_statistics.py``. Each seed scatters the holes anew, simulates the
-specimen with polynomials of degree 4, and photographs it: dots of ink on its speckle, behind a lens
-that is known, noise in each image and each force. A model on
-another mesh, of degree 3, identifies the material, the tilt, and x, y and the diameter of every
-hole; the last steps have the residual of a third mesh of degree 4. It begins at the true values, by
-states that are linear about these. ``--holes hidden``: the holes are taken for the drawing's; by
-the model itself. ``--whole``: from values off by a factor of two, by the model itself. A dask
-campaign: what is stopped goes on.
+specimen with polynomials of degree 4, and photographs it with dots of ink on its speckle, through a
+known lens, with noise in images and forces. A model of degree 3 on another mesh identifies the
+material, the tilt, and x, y and diameter of every hole; the last steps use the residual of a third
+mesh of degree 4. It starts at the true values, and its states are linear about them. ``--holes
+hidden`` takes the holes as drawn, and uses the model itself. ``--whole`` uses it, too, from values
+off by a factor of two. A dask campaign, which continues where it was stopped. Table:
+docs/explanation/identification_supports.md.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ OWN = tuple(f"holes[{k}].{part}" for k in range(len(SPECIMEN.hole_centres)) for 
 MODEL = 0.35
 """Size of the model's elements [mm]."""
 LENS = CameraDistortion(700.0, 700.0, 170.0, 140.0, k1=0.2, p1=0.01)
-"""Up to 8 px in a corner of images of 0.03 mm/px, 47 px in those of 0.02 mm/px."""
+"""Shifts corners of images of 0.03 mm/px by up to 8 px, of 0.02 mm/px by up to 47 px."""
 SPECKLE = SpeckleSpec(ink=Ink())
 REACH_MM = 0.07
 
@@ -133,7 +133,7 @@ def report(done: pd.DataFrame) -> None:
 
 @dataclass(frozen=True)
 class Setting:
-    """What all seeds of a campaign have in common."""
+    """Models that all seeds of a campaign share."""
 
     twin: ParametricTest
     model: ParametricTest
@@ -143,14 +143,14 @@ class Setting:
 
 @cache
 def setting(names: tuple[str, ...], finer_mesh: float, twin_mesh: float) -> Setting:
-    """Made once in a worker."""
+    """Make the setting, once in each worker."""
     sizes = (twin_mesh, 4, ("tilt", *OWN)), (MODEL, 3, names), (finer_mesh, 4, names)
     twin, model, fine = (made(*size, last=LAST) for size in sizes)
     return Setting(twin, model, fine, MeshPixels(model.mesh))
 
 
 def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """What is identified from a specimen, and how far off that is."""
+    """Identify the parameters of one specimen; their errors and standard deviations."""
     seed, is_hidden = case["seed"], case["holes"] == "hidden"
     names = tuple(TRUE) if is_hidden else (*TRUE, *OWN)
     known = setting(names, case["finer_mesh"], case["twin_mesh"])
@@ -204,7 +204,7 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def photographed(
     case: Mapping[str, Any], solution: Solution, pixels: MeshPixels
 ) -> list[ImageData]:
-    """Camera images of all states."""
+    """Make camera images of all states."""
     seed, strains = case["seed"], [s.nominal_strain for s in solution.snapshots]
     sensor = Sensor(read_noise=NOISE, read_seed=seed)
     spec = ImagingSpec(case["pixel_size"], margin_px=12, bits=12, sensor=sensor)

@@ -1,13 +1,13 @@
-"""How fast images are made, and how exact they are beside interpolating the reference image.
+"""Speed and accuracy of making images, compared with interpolation of the reference image.
 
-The shipped solution of the paper's specimen (T6) at full size, on one thread in one process:
-the inverse mapping of every pixel, the points of the undeformed specimen that they show, the
-speckle there, and what is often done instead, a spline through the reference image (prefilter
-included). All run in turn, so that a busy machine hits all alike; times are medians. The truth
-of the errors is the trigonometric polynomial itself, summed term by term at some points.
+The shipped solution of the paper's specimen (T6) at full size, on one thread: inverse mapping of
+every pixel, the points of the undeformed specimen that they show, the speckle there, and for
+comparison splines through the reference image (prefilter included). All run alternately in one
+process, so that other load affects all alike; times are medians. Errors are against the
+trigonometric polynomial, summed term by term at some points (docs/explanation/idic.md).
 
-Then whole images from 1 to 50 Mpx on all threads: what a pixel costs, in time and in memory. The
-pattern's period is 2048 px there, so that the memory is that of making images alone.
+Then, or with --growth alone, whole images of 1 to 50 Mpx on all threads: time and memory per pixel.
+The pattern's period is 2048 px there, so that the memory is that of making images alone.
 
 Run: scripts/env python benchmarks/image_stage.py [--growth]
 """
@@ -41,7 +41,7 @@ Work = Callable[[], Any]
 
 
 def in_turn(contestants: dict[str, Work]) -> dict[str, tuple[Any, float]]:
-    """What each gives, and its median seconds over some rounds after one that compiles."""
+    """Results, and their median times [s] over alternate rounds after one that compiles."""
     results = {name: work() for name, work in contestants.items()}
     laps: dict[str, list[float]] = {name: [] for name in contestants}
     for _ in range(ROUNDS):
@@ -64,7 +64,7 @@ def term_by_term(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArr
 
 
 def render(mesh: Mesh, u: FloatArray, grid: PixelGrid, speckle: Speckle) -> NDArray[np.float32]:
-    """The grey levels at all pixel centres, on a black background, as of a deformed state."""
+    """Image of a deformed state at pixel centres, on a black background [0 ... 1]."""
     located = locate(mesh.nodes + u, mesh.cells, mesh.element, grid, nodal=mesh.nodes)
     (x, y), mask = located.values, located.mask
     image = np.zeros(grid.shape, np.float32)
@@ -75,7 +75,7 @@ def render(mesh: Mesh, u: FloatArray, grid: PixelGrid, speckle: Speckle) -> NDAr
 def growth(mesh: Mesh, u: FloatArray) -> None:
     """Print seconds and peak memory of images of growing size.
 
-    Memory shows where it exceeds what making the pattern took.
+    Memory is printed where it exceeds that of making the pattern.
     """
     speckle = Speckle(SpeckleSpec(), (2048, 2048))
     render(mesh, u, PixelGrid.centred(300, 250, 0.08), speckle)
@@ -88,7 +88,7 @@ def growth(mesh: Mesh, u: FloatArray) -> None:
         seconds = []
         shown = None
         for _ in range(3):
-            del shown  # two images at a time would count twice
+            del shown  # or two images would be in memory
             begin = time.perf_counter()
             shown = render(mesh, u, grid, speckle)
             seconds.append(time.perf_counter() - begin)
@@ -110,7 +110,7 @@ def main() -> None:
 
 
 def stages(mesh: Mesh, u: FloatArray) -> None:
-    """Print what the stages of an image cost, beside interpolating the reference image."""
+    """Print the cost of the stages of an image, and of interpolating the reference image."""
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     grid = PixelGrid.centred(2207, 1651, 0.01)

@@ -1,13 +1,13 @@
-"""A map of initial guesses: how far off the mode's parameters may be for a correlation to arrive.
+"""Convergence of the correlation from initial guesses with wrong parameters of the mode.
 
-The paper's case after buckling (12.8 %), noise-free images at its resolution. All seven
-parameters of the mode are put off the ideal at once: a1 ... a5 by up to a share of 1, the two
-phases by up to that share of the unit cell; at random within the box, and at random corners of
-it. v0 starts with the applied strain, v1 with the constant, as always. An end is *the same* as
-that of the standard guess if the displacements are less than 0.01 px rms apart.
+The paper's case after buckling (12.8 %), noise-free images at its resolution. All seven parameters
+of the mode are changed at once: a1 ... a5 by up to a share of 1, the two phases by up to that share
+of the unit cell; at random within the box, and at random corners of it. v0 starts with the applied
+strain, v1 with a constant, as always. A result is *the same* as that of the standard guess if the
+displacements are less than 0.01 px rms apart. Table: docs/explanation/metrology.md.
 
-The images are made once, in out/initial_guesses; so is a file of what was found, and a run goes on
-where it was stopped. Remove that file (initial_guesses-....json) after a change of the solver.
+The images are made once, in out/initial_guesses, with a file of the results, from which a run
+continues. Remove that file (initial_guesses-....json) after a change of the solver.
 
 Run: scripts/env python benchmarks/initial_guesses.py [--quick] [--count 16] [--picture FILE]
 """
@@ -41,32 +41,32 @@ STRAIN = 0.128
 RADII = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 SAME_PX = 0.01
 EVERY = 4
-"""Displacements are compared at every fourth pixel: they are smooth."""
+"""Displacements are compared at every fourth pixel, because they are smooth."""
 QUICK_PIXEL = 0.04
 
 
 @dataclass(frozen=True)
 class End:
-    """Where an initial guess led.
+    """Result of one initial guess.
 
     Parameters
     ----------
     radius
-        How far off it was at most [share of 1, or of a unit cell].
+        Largest change of a parameter [share of 1, or of a unit cell].
     corner
-        Off by that much in all parameters, or by a random part of it.
+        Whether all parameters are changed by that much, or by a random part of it.
     distance_px
-        From the standard guess's end, rms length [px].
+        From the result of the standard guess, rms length [px].
     start_distance_px
-        The guess's own distance from there [px].
+        Distance of the initial guess from that result, rms length [px].
     outcome
-        Why the iteration ended.
+        Outcome of the correlation.
     iterations, all_iterations
         On the full image, and on all levels.
     residual
-        Rms [fraction of full scale].
+        Rms residual [fraction of full scale].
     seconds
-        That it took.
+        Wall-clock time [s].
     """
 
     radius: float
@@ -81,7 +81,7 @@ class End:
 
     @property
     def is_same(self) -> bool:
-        """Whether it is the standard guess's minimum."""
+        """Whether the end is the minimum of the standard guess."""
         return self.distance_px < SAME_PX
 
 
@@ -118,7 +118,7 @@ class Map:
         )
 
     def disturbed(self, radius: float, corner: bool, seed: int) -> FloatArray:
-        """Put the mode's parameters off; the same directions for every radius."""
+        """Change the mode's parameters, in the same directions for every radius."""
         rng = np.random.default_rng(seed)
         unit = rng.choice([-1.0, 1.0], 7) if corner else rng.uniform(-1.0, 1.0, 7)
         start = self.standard.copy()
@@ -137,14 +137,14 @@ class Map:
 
 
 def wanted(count: int) -> Iterator[tuple[float, bool, int]]:
-    """Radius, corner or not, seed."""
+    """Radius, whether a corner, and seed of every initial guess."""
     for radius in RADII:
         for seed in range(count):
             yield radius, seed % 2 == 1, seed
 
 
 def explore(pixel_size: float, count: int, record: Path) -> list[End]:
-    """Correlate from every initial guess that is not on record yet."""
+    """Correlate from every initial guess that is not in the file of results yet."""
     done: dict[str, Any] = read_json(record) if record.is_file() else {}
     where = Map(pixel_size)
     nominal = where.correlate(where.standard)
@@ -202,7 +202,7 @@ def span(counts: list[int]) -> str:
 
 
 def draw(ends: list[End], path: Path) -> None:
-    """Draw the shares over the radius."""
+    """Draw the shares of initial guesses over the radius."""
     made = figure(5.0, 3.6)
     axes = made.add_subplot()
     percent = [100 * r for r in RADII]

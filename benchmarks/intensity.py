@@ -1,8 +1,8 @@
-"""How far the images' grey levels are from the analytic pattern, before they are rounded.
+"""Errors of the images' grey levels against the analytic pattern, before they are rounded.
 
 A window of the paper's specimen after buckling (the shipped solution). At some random pixels the
 rendered float32 image is compared with the pattern at the material point that the pixel shows,
-computed twice, by routes that share no code with the renderer or with each other:
+computed in two ways that share no code with the renderer or with each other:
 
 spectral sum
     Fourier coefficients by matrix products with the binary pattern, then the sum of all plane
@@ -11,10 +11,10 @@ quadrature
     the binary pattern times a Gaussian centred on the point, summed in space out to 12 standard
     deviations, which is the trapezoidal rule for the blur's integral.
 
-Then the same window as a sensor sees it, whose pixels average over an area behind a lens: the
-rule that the renderer chose against one with 16 x 16 points in every pixel, for pixels that lie
-in one element and for those that an element's edge (where the deformation has a kink) cuts. At
-holes, where material meets background, against 1597 evenly scattered points (good to 0.0011).
+Then the same window for a sensor whose pixels average over an area behind a lens: the renderer's
+rule against 16 x 16 points in every pixel, for pixels within one element and for pixels cut by an
+element's edge (where the deformation has a kink); at holes, where material meets background,
+against 1597 evenly scattered points (accurate to 0.0011). Tables: docs/explanation/imaging.md.
 
 Run: scripts/env python benchmarks/intensity.py
 """
@@ -112,10 +112,10 @@ def square_rule(aperture: Aperture, side: int) -> tuple[FloatArray, FloatArray]:
 def aperture_errors(
     imaged: ImagedState, aperture: Aperture, fine: int = 16, finest: int = 1597
 ) -> tuple[int, dict[str, FloatArray]]:
-    """Points a pixel, and the errors of single pixels, by where these lie.
+    """Points per pixel, and the errors of single pixels, by where these lie.
 
-    They are compared with a rule of ``fine`` points a side; at the edges of holes, where a rule
-    for smooth functions is no help, with ``finest`` evenly scattered points.
+    Errors are against a rule of ``fine`` points a side; at the edges of holes, where a rule for
+    smooth functions fails, against ``finest`` evenly scattered points.
     """
     assert imaged.displacement is not None
     mesh, grid = imaged.mesh, imaged.grid
@@ -141,7 +141,7 @@ def aperture_errors(
 
 
 def part_in(grid: PixelGrid, mesh: Mesh, displacement: FloatArray) -> Mesh:
-    """The mesh without the elements that stay outside a grid, a margin of 0.3 mm included."""
+    """The mesh without the elements that lie outside a grid by more than 0.3 mm if deformed."""
     left, right, bottom, top = np.add(grid.extent, [-0.3, 0.3, -0.3, 0.3])
     x, y = (mesh.nodes + displacement)[mesh.cells].transpose(2, 0, 1)
     inside = ((x > left) & (x < right) & (y > bottom) & (y < top)).any(axis=1)

@@ -1,11 +1,11 @@
-"""A displacement inside the ansatz, exact images of it, and the bound of any measurement of it.
+"""A displacement in the ansatz, exact images of it, and the Cramer-Rao bound of its measurement.
 
-With J the derivatives of f(x) - g(x + u), made from the exact gradient of the pattern (the
-correlation's own matrix has no part in it), the Cramer-Rao bound is
+With J the derivatives of f(x) - g(x + u) by the unknowns, made from the exact gradient of the
+pattern (not from the correlation's matrix), and noise s_f in f and s_g in g, the bound is
 
     (J' W J)^-1,   1/W = s_f^2 + s_g^2 / det F,
 
-because where the material has shrunk fewer pixels of g look at it. Noise s_f in f, s_g in g.
+because fewer pixels of g show material that has shrunk. Used by cramer_rao.py.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ STRAIN = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A displacement that the ansatz can describe, and what the bound needs of it.
+    """A displacement that the ansatz can describe, with its images and its bound.
 
     Parameters
     ----------
     ansatz, a
-        Kinematics and true unknowns.
+        Ansatz and true unknowns (n,).
     """
 
     ansatz: Ansatz
@@ -47,7 +47,7 @@ class Truth:
 
     @classmethod
     def default(cls) -> Truth:
-        """Strain, pattern and everything else disturbed; up to 11 px of displacement."""
+        """Strain of 5 %, pattern, random changes of all unknowns; displacements of up to 11 px."""
         everywhere = Taper(Box.centred(3.4, 3.8), 0.5)
         mode = FourierMode.scaled(square_family("junction"), 1.0, everywhere)
         ansatz = Ansatz(Box.centred(2.6, 3.0), (mode,))
@@ -61,7 +61,7 @@ class Truth:
 
     @cached_property
     def mask(self) -> NDArray[np.bool_]:
-        """Pixels that no noise and no displacement moves off the image."""
+        """(rows, cols) True on pixels that the displacement does not move off the image."""
         mask = np.zeros(GRID.shape, dtype=np.bool_)
         mask[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
         return mask
@@ -73,14 +73,14 @@ class Truth:
 
     @cached_property
     def sensitivities(self) -> FloatArray:
-        """(pixels, 2, n) of the displacement, x and y."""
+        """(pixels, 2, n) derivatives of the displacement along x and y by the unknowns."""
         row, col = self.used
         points = GRID.x[col, None], GRID.y[row, None]  # two-dimensional: points, not axes
         return self.ansatz.sensitivities(self.a, *points)[:, 0]
 
     @cached_property
     def deformation_gradient(self) -> FloatArray:
-        """(pixels, 2, 2) F, by central differences: h^2 of the pattern's third derivative."""
+        """(pixels, 2, 2) F by central differences, with errors of the order h^2."""
         row, col = self.used
         at, h = np.stack([GRID.x[col], GRID.y[row]], axis=-1), 1e-5
         F = np.tile(np.eye(2), (len(at), 1, 1))
@@ -96,7 +96,7 @@ class Truth:
         low, high = at[-1, 0], at[0, -1]
         point = at
         for _ in range(300):
-            # Polynomials run away outside the image; what comes from there isn't correlated.
+            # Polynomials grow fast outside the image; points from there aren't correlated.
             moved = at - self.ansatz.displacement_at(self.a, np.clip(point, low, high))
             change = abs(moved - point).max()
             point = moved

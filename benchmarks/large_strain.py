@@ -1,10 +1,10 @@
-"""A sequence of photographs up to local strains of 100 %: in both formulations, modes and all.
+"""Harvest of a sequence of photographs with large strains, in both formulations.
 
 A specimen of 4 x 4 holes is stretched step by step, with a pattern and a w that grow with the
-strain; its photographs are those of the tests (``tests/synthetic_photographs.py``), 8 bit, with
-noise of 1 % of their contrast. Of every state: the largest stretch of the material less 1, how the
-correlation ended, and how far, rms per component in px, its result and the refitted ansatz are from
-the best fit of the ansatz, and the whole displacement from the truth.
+strain. Photographs are those of the tests (``tests/synthetic_photographs.py``), 8 bit, noise of 1 %
+of their contrast. Printed for every state are the largest stretch of the material less 1, the
+outcome, rms distances per component [px] of the result and of the refitted ansatz from the best fit
+of the ansatz, and errors of the whole displacement. Table: docs/explanation/whole_field_speckle.md.
 
 Run: scripts/env python benchmarks/large_strain.py [--step 0.1] [--last 0.7]
      [--out out/large_strain]
@@ -37,11 +37,11 @@ HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, PITCH / 2))
 ANSATZ = Ansatz.on(DOMAIN, [(square_family("junction"), CELLULAR)], PITCH)
 PHOTOGRAPHED = Photographed(PixelGrid.centred(360, 640, PIXEL), DOMAIN, HOLES, 1.3)
 W_PX, PATTERN = 1.5, 3.0
-"""Amplitudes of w and of v1 [mm] at a strain of 1."""
+"""Amplitudes of w [px] and of v1 [mm] at a strain of 1."""
 
 
 def truth(strain: float, points: FloatArray) -> FloatArray:
-    """Displacements at points (..., 2) of a state [mm]: stretched along x, narrower along y."""
+    """(..., 2) displacement at points (..., 2) [mm]: longer along x, narrower along y, v1, w."""
     a = ANSATZ.initial_guess(0.0, strain * PATTERN)
     pattern = ANSATZ.displacement_at(a, points.reshape(-1, 2)).reshape(points.shape)
     x, y = np.moveaxis(2.0 * np.pi * points / PITCH, -1, 0)

@@ -1,8 +1,8 @@
-"""A lens from two images of one scene, without and with its distortion.
+"""A lens from two images of one scene, without and with its distortion; used by distortion.py.
 
-Such pairs are made in a computer, or by two lenses one of which is ideal. The target doesn't move,
-so all of S is observable, its affine part included: the fit that calibrations rest on is compared
-with a known camera (docs/how-to/distortion.md).
+Such pairs are computed, or taken through two lenses one of which is ideal. The target doesn't move,
+so all of S is observable, its affine part included. The fit that calibrations use can therefore be
+compared with a known camera (docs/how-to/distortion.md).
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ FloatArray = NDArray[np.float64]
 _BLURS_PX = (12.0, 6.0, 3.0, 0.7)
 _COARSE_POINTS, _COARSE_DEGREE = 30_000, 3
 _MARGIN_PX = 8.0
-"""Nearer to the edge of the image blur and spline see beyond the edge of the scene."""
+"""Margin along the image's edge, where blur and spline use values beyond the scene."""
 
 
 @dataclass(frozen=True)
 class CameraModel:
     """A camera, some parameters of which are unknown; coefficients change S by about 1 px each.
 
-    Takes the place of a :class:`PolynomialModel`.
+    It is used in place of a :class:`PolynomialModel`.
     """
 
     camera: CameraDistortion
-    """The parameters that are known, and where the unknown ones begin."""
+    """The known parameters, and initial values of the unknown ones."""
     unknown: tuple[str, ...] = ("cx", "cy", "k1", "k2", "k3")
-    """Names among cx, cy and k1 ... p2; not focal lengths: another f with other k is that S."""
+    """Names among cx, cy and k1 ... p2; not focal lengths: with other k they give the same S."""
 
     def __post_init__(self) -> None:
         known = tuple(f.name for f in fields(CameraDistortion))[2:]
@@ -102,15 +102,15 @@ def recover_camera(
     points: int = 200_000,
     order: int = 5,
 ) -> LensEstimate:
-    """Find the lens that shows the scene of one image as another.
+    """Find the lens from two images of one scene, without and with its distortion.
 
     InputError if sizes differ, an image is blank, or the images don't show the same scene.
 
     undistorted, distorted : (rows, cols) grey levels of one scene.
-    model : what the lens may be: a :class:`CameraModel` or a :class:`PolynomialModel` with
+    model : form of the lens: a :class:`CameraModel` or a :class:`PolynomialModel` with
         ``fixed=0``. By default an OpenCV camera with unknown cx, cy, k1, k2, k3; its focal length
         is taken as the larger size of the image, because another f with other k is the same S.
-    mask, points : (rows, cols) where the undistorted image counts; about how many pixels of it.
+    mask, points : (rows, cols) True where the undistorted image is used; about how many pixels.
     order : of the spline that samples the images: 5 or 3.
     """
     images = checked_images((undistorted, distorted), ("undistorted", "distorted"))
@@ -118,7 +118,7 @@ def recover_camera(
     focal = float(max(rows, cols))
     lens = CameraDistortion(focal, focal, 0.5 * (cols - 1), 0.5 * (rows - 1))
     wanted: Any = model or CameraModel(lens)
-    # Far from the solution a cubic is led less astray than a camera or a high degree.
+    # Far from the solution a cubic is more robust than a camera or a high degree.
     coarse = PolynomialModel((rows, cols), _COARSE_DEGREE, fixed=0)
     c, poses = coarse.start, normalised_illumination(images)
     at, _ = _points(rows, cols, _COARSE_POINTS, mask)
@@ -140,14 +140,14 @@ def recover_camera(
 def _views(
     images: Sequence[NDArray[np.float32]], poses: FloatArray, blur: float, order: int, light: bool
 ) -> list[View]:
-    """The image without and that with distortion; of the latter the light may change."""
+    """Views of the images without and with distortion; ``light``: gain and offset are free."""
     ideal, observed = (blurred_spline(image, blur, order) for image in images)
     free = (False, False, False, light, light)
     return [View(ideal, poses[0], distorted=False), View(observed, poses[1], free)]
 
 
 def _nearest(model: Any, distortion: Distortion, shape: tuple[int, int]) -> FloatArray:
-    """Coefficients with which a model comes nearest to a distortion over the image."""
+    """Coefficients of a model that is nearest to a distortion over the image."""
     axes = [np.linspace(0.0, n - 1.0, 21) for n in shape]
     row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     target = np.stack(distortion.shift(row, col))
@@ -165,7 +165,7 @@ def _nearest(model: Any, distortion: Distortion, shape: tuple[int, int]) -> Floa
 def _points(
     rows: int, cols: int, count: int, mask: ArrayLike | None
 ) -> tuple[tuple[FloatArray, FloatArray], float]:
-    """Pixels of the undistorted image to look at, and their stride [px]."""
+    """Rows and columns of the pixels of the undistorted image that are used; their stride [px]."""
     stride = max(1, round(np.sqrt(rows * cols / count)))
     axes: list[FloatArray] = [np.arange(_MARGIN_PX, n - _MARGIN_PX, stride) for n in (rows, cols)]
     row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))

@@ -1,9 +1,9 @@
-"""How far local fields, and the starts read from them, are from the truth.
+"""Errors of local displacement fields, and of the initial guesses that are made from them.
 
-    scripts/env python benchmarks/local_fields.py [--pixel-size 0.02] [--subset 21]
+    scripts/env python benchmarks/local_fields.py [--pixel-size 0.02] [--subset 21] [--filling 1]
 
-The paper's specimen before and after buckling, 8-bit images. Rows: the optical flow that stands in
-where there is no local DIC, and pyvale's subsets if MODEHARVEST_PYVALE names a Python that has it.
+The paper's specimen before and after buckling, 8-bit images. Fields: the optical flow used without
+local DIC, and pyvale's subsets if MODEHARVEST_PYVALE names its Python (docs/how-to/fields.md).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def local(images: ImageSet, strain: float, subsets: SubsetOptions) -> LocalField | None:
-    """pyvale's field; None without pyvale."""
+    """Measure pyvale's field; None without pyvale."""
     try:
         pyvale_python()
     except MissingDependencyError as missing:
@@ -50,7 +50,7 @@ def local(images: ImageSet, strain: float, subsets: SubsetOptions) -> LocalField
 def tell(
     images: ImageSet, strain: float, field: LocalField, start: InitialGuess, found: Result
 ) -> None:
-    """One block of numbers, all in px and per component."""
+    """Print the errors of a field and of the guess from it, in px per component."""
     truth, grid, mask = images.truth(strain).displacement, images.grid, images.mask()
     x, y, u = field.valid_points()
     row, col = (np.rint(i).astype(int) for i in grid.to_px(x, y))

@@ -1,9 +1,9 @@
-"""How exactly material, holes and their motion are found in images whose truth is known.
+"""Accuracy of the material mask and of the holes' motion in images whose truth is known.
 
 The paper's virtual specimen, undeformed and at 12.8 % after buckling, photographed with noise on
 four backgrounds: ``python benchmarks/material.py``. Columns: wrong pixels of the mask; distance of
-the mask's edge from the true one (bias: positive is too little material; rms); rms error of the
-hole centres' motion, against the mean true motion of the material around each hole.
+its edge from the true one (bias: positive is too little material; rms); rms error of the holes'
+motion, against the mean true motion around each (docs/how-to/photographs.md).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.photograph.holes import find_hole_lattice
-from modeharvest.idic.photograph.matching import HoleMotion, possible_motions
+from modeharvest.idic.photograph.matching.holes import HoleMotion, possible_motions
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import Truth
@@ -38,7 +38,7 @@ def edge_distance(found: BoolArray, truth: BoolArray) -> NDArray[np.float64]:
 
 
 def motion_error(motion: HoleMotion, images: ImageSet) -> float:
-    """Rms over holes and components [px]."""
+    """Rms error of the holes' motion, over holes and components [px]."""
     grid, mask = images.grid, images.mask()
     u = Truth.read(images.folder / images.info["snapshots"][0]["truth"]).displacement
     row, col = np.mgrid[: grid.rows, : grid.cols]

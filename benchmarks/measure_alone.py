@@ -1,10 +1,9 @@
-"""'modeharvest measure' on images of all kinds, for which it has to find its start by itself.
+"""Accuracy of 'modeharvest measure' on images of many kinds, with its own initial guess.
 
-It gets what a user has: 8-bit images and the reference's mask, no lattice, no mode, no mask of the
-deformed images. Of each deformed image: the cut-off wavelength, error rms per component, below what
-the errors of 95 and of 99.9 % of the pixels are, the largest one, how often 95 % intervals hold,
-the share of the material that is measured, and the seconds it took; errors of the last image where
-there are several.
+Its input is a user's: 8-bit images and the reference's mask, no lattice, no mode, no mask of the
+deformed images. For the last image of each case: cut-off wavelength [px], rms error per component,
+95 and 99.9 % quantiles and largest length of the error vector [px], coverage of 95 % intervals,
+share of the material that is measured, and seconds. Table: docs/how-to/measure.md.
 
 Run: scripts/env python benchmarks/measure_alone.py [--only CASE ...] [--out out/measure_alone]
 """
@@ -40,7 +39,7 @@ from modeharvest.validation.scoring.star import Star, exact_images, fine_speckle
 from modeharvest.validation.truth import rms
 
 Images = tuple[list[np.ndarray], np.ndarray, np.ndarray]
-"""Reference and deformed images [0 ... 1], mask, and the last one's u (rows, cols, 2), up [px]."""
+"""Reference and deformed images [0 ... 1], mask, u of the last one (rows, cols, 2), y up [px]."""
 
 
 def specimen(
@@ -51,9 +50,10 @@ def specimen(
     light: float = 0.0,
     **imaging: Any,
 ) -> Images:
-    """A state of a shipped solution, with finer speckle, noise, or light that changes by a share.
+    """Images of a state of a shipped solution, with finer speckle, noise, or changed light.
 
-    ``light``: how much brighter the deformed image is at its right end, and darker at its left.
+    ``light``: relative increase of the deformed image's brightness at its right end, decrease at
+    its left.
     """
     spec, solution = Case.read(case).imaging, shipped_solution(case)
     speckle = replace(
@@ -69,7 +69,7 @@ def specimen(
 
 
 def plate(folder: Path) -> Images:
-    """A plate of 20 x 16 mm with a hole of 6 mm, at 6 %."""
+    """Images of a plate of 20 x 16 mm with a hole of 6 mm, at 6 %."""
     from modeharvest.fem.simulate import simulate
 
     body = Specimen(1, 1, diameter=6.0, pitch=12.0, bulk_x=4.0, bulk_y=2.0)
@@ -88,7 +88,7 @@ def imaged(solution: Solution, spec: Any, folder: Path, strain: float, light: fl
 
 
 def star(folder: Path, noise: float = 0.0) -> Images:
-    """The star images of resolution.md: waves of 10 to 300 px, half a pixel high."""
+    """The star images of docs/explanation/resolution.md: periods of 10 to 300 px, 0.5 px high."""
     shape = Star()
     f, g, _ = exact_images(shape, fine_speckle())
     random = np.random.default_rng(0)
@@ -100,7 +100,7 @@ def star(folder: Path, noise: float = 0.0) -> Images:
 def rigid(
     folder: Path, shift: tuple[float, float], turn_deg: float, noise: float = 0.0, size: float = 1.0
 ) -> Images:
-    """A plate that moves and turns as a whole, in front of a dark background."""
+    """Images of a plate that shifts and turns as a rigid body, before a dark background."""
     grid, random, spec = PixelGrid.centred(500, 600, 1.0), np.random.default_rng(0), fine_speckle()
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     spec = replace(spec, standard_deviation=spec.standard_deviation / size,
@@ -123,7 +123,7 @@ def _inside(points: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 
 def stretch(folder: Path, strains: Sequence[float]) -> Images:
-    """A sequence of 4 x 4 holes that is stretched, with pattern and w (large_strain.py)."""
+    """Images of a specimen with 4 x 4 holes, stretched, with pattern and w (large_strain.py)."""
     images = [PHOTOGRAPHED.image(None) / 255.0]
     for n, strain in enumerate(strains):
         images.append(PHOTOGRAPHED.image(lambda p, e=strain: stretched(e, p), n + 1) / 255.0)
@@ -170,12 +170,12 @@ def main() -> None:
         try:
             degree = int(name.rsplit(" ", 1)[1]) if "--brightness" in name else 0
             print(f"| {name} | {row(CASES[name], folder, degree)} |", flush=True)
-        except Exception as error:  # the others are wanted, too
+        except Exception as error:  # the other cases follow
             print(f"| {name} | {type(error).__name__}: {error} |", flush=True)
 
 
 def row(make: Callable[[Path], Images], folder: Path, brightness: int = 0) -> str:
-    """Measure a case, whose light may vary by polynomials of a degree; returns its numbers."""
+    """Measure a case, gain and offset of degree ``brightness``; returns the columns of its row."""
     images, mask, truth = make(folder)
     files = [folder / f"image_{n:02d}.tif" for n in range(len(images))]
     for file, image in zip(files, images, strict=True):

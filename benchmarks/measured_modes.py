@@ -1,26 +1,26 @@
-"""What measured modes are worth: how good a test has to be for a homogenized force right to 1 %.
+"""Accuracy that a test needs for a homogenized force that is right within 1 %.
 
 For every d/l a 6 x 10 specimen is compressed until its pattern is three quarters as strong as the
-paper's at 12.8 %, photographed as there without noise and with it, and the mode is measured in the
-images. Homogenization with that mode (a quarter, 24 RVEs) predicts the critical strain, the force
-at that strain and the rms of v1. Three tables, as Markdown:
+paper's at 12.8 %. It is photographed like that, without and with noise, and the mode is measured in
+the images. Homogenization with that mode (a quarter, 24 RVEs) predicts the critical strain, and at
+the strain of the images the force and the rms of v1. Three tables are printed, as Markdown:
 
-- what it predicts with the noise-free mode, beside the direct simulation;
-- parameter by parameter what an error of 1 % (of l for phases) makes of the prediction if the mode
-  is used *as it was measured*, up or down, whichever does more, and which error makes 1 % of the
-  force. Amplitudes act everywhere, phases are those in the specimen's middle. An error of a wave
-  number shifts the pattern the more the farther it is from there: what is said is what it does at
-  the ends of the cellular part along x or y;
-- for each noise the rms error of the parameters over the seeds (from the noise-free measurement),
-  the mean of their standard deviations by noise and by model error, of each kind those of the
-  worst parameter, and the errors of the prediction that are left once the mode is snapped: those
-  by its amplitudes, to first order.
+- the prediction with the noise-free mode, beside the direct simulation;
+- for each parameter, the change of the prediction by an error of 1 % (of l for phases), up or down,
+  whichever is larger, if the mode is used *as it was measured*; and the error that changes the
+  force by 1 %. Amplitudes act everywhere, phases are those in the specimen's middle. An error of a
+  wave number shifts the pattern in proportion to the distance from there; the table has its effect
+  at the ends of the cellular part along x or y;
+- for each noise, the rms error of the parameters over the seeds (from the noise-free measurement),
+  and the mean of their standard deviations by noise and by model error, each of the worst parameter
+  of a kind; and the errors of the prediction that remain if the mode is snapped: those by its
+  amplitudes, to first order.
 
 Run: scripts/env python benchmarks/measured_modes.py [--ratios 0.7 ...] [--noise 0.005 ...]
      [--seeds 3] [--parameters a1 ...] [--out FOLDER]
 
-The folder keeps the solutions and images, so that an interrupted run continues. Some five minutes
-for each d/l, and more where ligaments are thin.
+The folder keeps solutions and images, so that an interrupted run continues. Some five minutes for
+each d/l, more where ligaments are thin (docs/explanation/homogenization_measured_mode*.md).
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ from modeharvest.validation.studies.modes_specimen import PatternCells, buckle
 
 FloatArray = NDArray[np.float64]
 PAPER, SHARE = 0.128, 0.75
-"""Nominal strain of the paper's specimen [-], and the share of its amplitude there that all get."""
+"""Nominal strain of the paper's specimen, and the fraction of its amplitude there for all [-]."""
 PITCH, LARGEST = 1.9, 0.35
-"""[mm]; nominal strain up to which a critical point is looked for [-]."""
+"""Pitch [mm]; nominal strain up to which a critical point is searched for [-]."""
 
 
 KINDS = ("amplitude", "wave number", "phase")
-"""Of a mode's parameters: [-], [pi/l], [mm]."""
+"""Kinds of a mode's parameters, in [-], [pi/l], [mm]."""
 
 
 def row(*cells: object) -> None:
@@ -81,16 +81,16 @@ def head(*cells: str) -> None:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Of a homogenized specimen."""
+    """Prediction of a homogenized specimen."""
 
     critical: float
     force: float
-    """At the strain of the images [N/mm]."""
+    """Force at the strain of the images [N/mm]."""
     v: float
     """Rms of v1 over the lattice at that strain [mm]."""
 
     def against(self, other: Prediction) -> FloatArray:
-        """(3,) relative differences from another one."""
+        """(3,) relative differences from another prediction."""
         mine, its = (np.array([p.critical, p.force, p.v]) for p in (self, other))
         return np.asarray(mine / its - 1.0)
 
@@ -104,17 +104,17 @@ class Test:
 
     @cached_property
     def specimen(self) -> Specimen:
-        """Six by ten holes."""
+        """Specimen with 6 x 10 holes."""
         return Specimen(diameter=self.ratio * PITCH)
 
     @property
     def size(self) -> float:
-        """Of the elements [mm]: two across a ligament at least."""
+        """Size of the elements [mm]: at least two across a ligament."""
         return min(0.2, 0.5 * PITCH * (1.0 - self.ratio))
 
     @cached_property
     def solution(self) -> Solution:
-        """Of the buckled state; simulated once."""
+        """Solution with the buckled state; simulated once."""
         path = self.folder / f"{self.ratio:g}.h5"
         if not path.exists():
             paper = Run(Case.read("paper-virtual"), self.folder / "paper").fem()
@@ -125,19 +125,19 @@ class Test:
 
     @property
     def strain(self) -> float:
-        """Of the buckled state."""
+        """Nominal strain of the buckled state [-]."""
         return self.solution.snapshots[0].nominal_strain
 
     @cached_property
     def images(self) -> ImageSet:
-        """Of the paper's imaging; made once."""
+        """Images with the paper's imaging; made once."""
         folder = self.folder / f"images_{self.ratio:g}"
         if not (folder / "images.json").exists():
             make_images(self.solution, ImagingSpec(), folder)
         return ImageSet.read(folder)
 
     def measured(self, noise: float, seed: int) -> tuple[Result, FloatArray, FloatArray]:
-        """The result, and (m,) standard deviations by noise and by model error of the mode's."""
+        """The result, and (m,) standard deviations of the mode by noise and by model error."""
         pair, how = noisy(self.images, self.strain, noise, seed), SquareLatticeOptions()
         result = correlate(pair, how.ansatz(self.specimen), strain=self.strain)
         found = covariance(result, pair, ImageNoise.of(result.noise_sd), PITCH, how.edge_px)
@@ -151,9 +151,9 @@ class Test:
         return LatticeMode.of(mode, parameters, self.specimen, self.cell.lattice).snapped
 
     def as_measured(self, mode: FourierMode, parameters: FloatArray, at: FloatArray) -> PlaneWaves:
-        """The mode with the phases that it has at a place of the specimen [mm], not snapped.
+        """The mode with its phases at a position ``at`` of the specimen [mm], not snapped.
 
-        In the lattice's coordinates, with its wave vectors: one RVE can't have others.
+        In the lattice's coordinates, with its wave vectors, because an RVE can't have others.
         """
         hole = self.specimen.hole_centres[0]
         waves = mode.family.waves(parameters)
@@ -162,11 +162,11 @@ class Test:
 
     @cached_property
     def cell(self) -> UnitCell:
-        """Of the RVE, 2 x 2 holes."""
+        """Unit cell of the RVE, 2 x 2 holes."""
         return square(PITCH, self.specimen.diameter, self.size).enlarged(2, 2)
 
     def predicted(self, pattern: PlaneWaves) -> Prediction:
-        """With a mode."""
+        """Homogenize a quarter of the specimen with a mode."""
         half = 0.5 * PITCH
         rve = RVE(self.cell, Experiment().material, [pattern], (half, half), "given")
         body = HomogenizedBody.of_specimen(
@@ -183,7 +183,7 @@ class Test:
 
 
 def report(test: Test, noises: list[float], seeds: int, parameters: Sequence[str] = ()) -> None:
-    """The tables of one d/l, of some parameters or all."""
+    """Print the tables of one d/l, for some parameters or all."""
     exact, noise_model, model_error = test.measured(-1.0, 0)
     mode, p, family = exact.ansatz.modes[0], exact.mode_parameters(), exact.ansatz.modes[0].family
     base = test.predicted(test.pattern(mode, p))
@@ -200,7 +200,7 @@ def report(test: Test, noises: list[float], seeds: int, parameters: Sequence[str
         if parameters and name not in parameters:
             continue
         changes = effect(test, mode, p, k, base)
-        # Of phases and of wave numbers the effect is even: it grows as the square of the error.
+        # The effect of phases and wave numbers is even: it grows as the square of the error.
         kind, size = kinds(mode)[k], 0.01 * (PITCH if unit == "mm" else 1.0)
         power = 1.0 if kind == "amplitude" else 2.0
         enough = size * (0.01 / abs(changes[1])) ** (1.0 / power)
@@ -223,15 +223,15 @@ def report(test: Test, noises: list[float], seeds: int, parameters: Sequence[str
 
 
 def grouped(mode: FourierMode, *values: FloatArray) -> list[str]:
-    """Of each kind of parameter the largest of some values (m,)."""
+    """Largest of some values (m,) for each kind of parameter, as text."""
     of = kinds(mode)
     return [", ".join(f"{v[of == kind].max():.1e}" for v in values) for kind in KINDS]
 
 
 def effect(test: Test, mode: FourierMode, p: FloatArray, k: int, base: Prediction) -> FloatArray:
-    """(3,) what 1 % of error of parameter k changes, the mode used with the phases it then has.
+    """(3,) relative changes of the prediction by an error of 1 % of parameter k.
 
-    The larger change of an error up and down: a quarter of the specimen tells them apart.
+    The larger one of an error up and down: in a quarter of the specimen they differ.
     """
     at, row_of = np.zeros(2), int(np.flatnonzero(mode.family.matrix[:, k])[0]) % 5
     if kinds(mode)[k] == "wave number":
@@ -246,7 +246,7 @@ def effect(test: Test, mode: FourierMode, p: FloatArray, k: int, base: Predictio
 
 
 def kinds(mode: FourierMode) -> NDArray[np.str_]:
-    """(m,) what the parameters are: of A, B, kx, ky, c of a wave."""
+    """(m,) kinds of the parameters, by their places among A, B, kx, ky, c of a wave."""
     names = (KINDS[0], KINDS[0], KINDS[1], KINDS[1], KINDS[2])
     columns = (np.flatnonzero(column)[0] % 5 for column in mode.family.matrix.T)
     return np.array([names[c] for c in columns])

@@ -1,7 +1,7 @@
-"""The spline's prefilter beside SciPy's: time, difference, and the orders there are.
+"""The spline's prefilter compared with SciPy's: time and difference, for three orders.
 
-An image of random grey levels at the paper's size, float32; all threads. SciPy filters in
-float64, on one thread. Times are medians of rounds in turn.
+An image of random grey levels at the paper's size, float32, all threads. SciPy filters in float64,
+on one thread. Times are medians of alternate rounds. Table: docs/decisions/0013-prefilter.md.
 
 Run: scripts/env python benchmarks/prefilter.py
 """
@@ -21,7 +21,7 @@ ROUNDS = 3
 
 
 def by_scipy(image: np.ndarray, order: int) -> np.ndarray:
-    """Coefficients by ``scipy.ndimage``; above its orders by ``scipy.signal``, pole by pole."""
+    """Coefficients by ``scipy.ndimage``; of orders above 5 by ``scipy.signal``, pole by pole."""
     if order <= 5:
         return ndimage.spline_filter(image, order, np.float64, "mirror")
     found = image.astype(np.float64)
@@ -31,7 +31,7 @@ def by_scipy(image: np.ndarray, order: int) -> np.ndarray:
         found = np.concatenate([found, found[..., -2:0:-1]], axis=-1)  # one period
         for z in poles(order):
             gain = (1.0 - z) * (1.0 - 1.0 / z)
-            for _ in (0, 1):  # a period to settle, there and back
+            for _ in (0, 1):  # a period to settle, both ways
                 twice = np.concatenate([found, found], axis=-1)
                 found = signal.lfilter([1.0], [1.0, -z], twice)[..., found.shape[-1] :][..., ::-1]
             found = -z * gain * found

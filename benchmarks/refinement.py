@@ -1,6 +1,6 @@
-"""Refined unit cells: each triangle divided into four while holes stay round.
+"""Refined unit cells: each triangle is divided into four, and holes stay round.
 
-Nested meshes show a rate of convergence undisturbed by a mesher's choices.
+Nested meshes give a rate of convergence that a mesher doesn't affect; used by bloch_scan.py.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from modeharvest.fem.bloch.mesh_error import refined
 from modeharvest.fem.field import boundary_sides
 from modeharvest.fem.lattice.cells import UnitCell
 
-_NEAR = 0.02  # of the radius: what of the boundary belongs to a hole
+_NEAR = 0.02  # fraction of the radius within which boundary nodes belong to the hole
 
 
 def refined_cell(cell: UnitCell, diameter: float) -> UnitCell:
-    """A unit cell refined, with its circular hole about the origin [mm]."""
+    """Refine a unit cell whose circular hole of ``diameter`` [mm] is at the origin."""
     mesh = refined(cell.mesh, 1e-7 * float(np.linalg.norm(cell.lattice, axis=1).min()))
     boundary = np.unique(boundary_sides(mesh))
     stretch = 0.5 * diameter / np.linalg.norm(mesh.nodes[boundary], axis=1)

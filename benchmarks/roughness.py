@@ -1,12 +1,12 @@
-"""Smoothness that counts less where the displacement is rough, against what is alike everywhere.
+"""Smoothness with less weight where the displacement is rough, against uniform weights.
 
-On the specimens of cutoff.py: two resolutions, 8-bit images and such with 1 and 2 % of noise,
-speckles of 4, 8 and 12 px. After the measurement as it is, jumps across sides weigh by the inverse
-of their mean square around there, to a power, and the cut-off wavelength is found again (C. Storlie
-et al., J. Comput. Graph. Stat. 19 (2010), have it so for splines). For each power: errors over
-those without weights, rms per component of all material and within 10 px of edges, the 99.9 %
-quantile and the longest; geometric means and ranges over the cases; how often 95 % intervals hold;
-and by how much the measurement takes longer.
+On the specimens of cutoff.py: two pixel sizes, 8-bit images and images with 1 and 2 % of noise,
+speckles of 4, 8 and 12 px. After the usual measurement, jumps across sides are weighted by the
+inverse of their mean square around there, to a power, and the cut-off wavelength is found again
+(for splines: C. Storlie et al., J. Comput. Graph. Stat. 19 (2010)). For each power: errors over
+those without weights (rms per component of all material and within 10 px of edges, 99.9 % quantile,
+longest) as geometric means and ranges over the cases; coverage of 95 % intervals; ratio of times.
+Table: docs/explanation/whole_field_alternatives.md.
 
 Run: scripts/env python benchmarks/roughness.py [--power 0.5 1] [--noise 0 0.01 0.02]
      [--speckle 4 8 12] [--pixel 0.01 0.02]
@@ -32,12 +32,12 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 
 AROUND, CONTRAST = 2, 100.0
-"""Elements on all sides over which roughness is a mean; its weight is at most, at least 1 over."""
+"""Layers of elements over which roughness is averaged; largest weight, and 1 over the least."""
 NAMES = ("all", "edges", "99.9 %", "longest")
 
 
 class Weighed(Smoothness):
-    """Smoothness on a body, less of it where displacements ``like`` (n, 2) are rough."""
+    """Smoothness on a body with less weight where displacements ``like`` (n, 2) are rough."""
 
     def __init__(self, body: Body, start: FloatArray, like: FloatArray, power: float) -> None:
         super().__init__(body, start)
@@ -98,7 +98,7 @@ def main() -> None:
 def rows(
     pair: ImagePair, specimen: Specimen, powers: list[float]
 ) -> list[tuple[float, FloatArray]]:
-    """Numbers of a measurement as it is, power 0, and of those that go on from it."""
+    """Numbers of the usual measurement, power 0, and of those that continue from it."""
     assert pair.truth is not None
     ansatz, options = (
         Ansatz.of_specimen(specimen, options=AnsatzOptions(4, 3)),
@@ -123,7 +123,7 @@ def rows(
 
 
 def numbers(course: _Measurement, pair: ImagePair, seconds: float) -> FloatArray:
-    """Cut-off wavelength, errors [px], shares of intervals that hold, seconds."""
+    """Cut-off wavelength and errors [px], coverage of 95 % intervals, seconds."""
     assert pair.truth is not None
     found, px, mask = course.result(), pair.grid.pixel_size, pair.masks[0]
     error = (found.displacement_on() - pair.truth.displacement) / px

@@ -1,11 +1,11 @@
-"""What grading a dense displacement field takes: seconds and memory.
+"""Time and memory of grading a dense displacement field.
 
-The truth of the paper's specimen at every so many pixels, with noise of 0.05 px, is left as NPZ and
-graded as 'modeharvest score' does, report included.
+The truth of the paper's specimen at points --spacing px apart, with noise of 0.05 px, is written as
+NPZ and graded as by 'modeharvest score', report included. Result: docs/how-to/scoring.md.
 
 Run: scripts/env python benchmarks/score_speed.py [--pixel 0.01] [--spacing 0.65] [FOLDER]
 
-FOLDER keeps the benchmark's images, which take longest to make, for another time.
+FOLDER keeps the benchmark's images, which take longest to make, for the next run.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STRAIN, NOISE_PX = 0.128, 0.05
 
 
 def dense_field(truth: BenchmarkTruth, spacing: float, path: Path) -> int:
-    """Leave the truth with noise at points so many pixels apart; returns their number."""
+    """Write the truth with noise at points ``spacing`` px apart; returns their number."""
     grid = truth.grid
     row, col = np.meshgrid(
         np.arange(0, grid.rows - 1, spacing), np.arange(0, grid.cols - 1, spacing), indexing="ij"

@@ -1,20 +1,20 @@
-"""Bias and scatter of small motions under noise: whether standard errors mean what they say.
+"""Bias and scatter of small motions under noise, compared with standard errors and the bound.
 
-Motions of many pixels average over all positions between pixels, and so over the bias that
-interpolated noise makes; small ones don't. Here images move by 0, 0.125 ... 1 px along x, along y
-and both ways, and stretch by 0 ... 1 %; noise is in both images or in one; speckles are 3 to 12 px
-wide; polynomials are of degree 1 to 5. Each realisation of the noise comes as n and as -n: the
-mean of the two errors shows a bias long before it would show out of the scatter.
+The bias by interpolated noise depends on positions between pixels. Motions of many pixels average
+it out; small ones don't. Here images move by 0, 0.125 ... 1 px along x, along y and both ways, and
+stretch by 0.1 to 1 %; noise is in both images or in one; speckles are 3 to 12 px wide; polynomials
+are of degree 1 to 5. Noise is used as n and as -n: the mean of the two errors shows a bias that the
+scatter would hide. 55 minutes of processor time; table: docs/explanation/metrology.md.
 
-The truth is in the ansatz, so that noise is all there is. The Cramer-Rao bound is made of
-the pattern's exact gradient. What a few realisations say of scatter is mostly chance; so errors
-are set against those that the efficient linear estimator makes under the very same noise, which
-are at the bound on average: I^-1 (sum J n_f over the pixels of f - sum J n_g/det F over those of
-g), I = sum J J'. Every motion has noise of its own: an estimator whose variance is a share e above
-the bound differs from the efficient one by a part of that variance that is uncorrelated with it,
-so that chi squared over the efficient one's scatters by 2 sqrt(e/n) in n independent errors. That
-standard error, estimated from the scatter of the pairs, stands behind each ratio. "Least squares"
-is the naive version: the deformed image's own gradient, and a quintic spline whatever the speckle.
+The truth is in the ansatz, so that noise is the only error. The Cramer-Rao bound uses the pattern's
+exact gradient. Scatter over a few realisations is mostly chance. Errors are therefore divided by
+those of the efficient linear estimator under the same noise, which is at the bound on average: I^-1
+(sum J n_f over the pixels of f - sum J n_g/det F over those of g), I = sum J J'. Every motion has
+its own noise. If the variance of an estimator is a share e above the bound, its error has an
+additional, uncorrelated part of that variance, and the ratio of chi squared to the efficient one's
+scatters by 2 sqrt(e/n) for n independent errors. This standard error, estimated from the scatter of
+the pairs, follows each ratio. "Least squares" uses the deformed image's gradient, and a quintic
+spline for all speckles.
 
 Run: scripts/env python benchmarks/small_motion.py [--pairs 8] [--step 0.125] [--only TEXT]
      [--json FILE]
@@ -50,7 +50,7 @@ GRID = PixelGrid.centred(220, 300, PIXEL)
 BORDER_PX = 24
 EVERY = 8
 PAPER_PX = 12.0
-"""Width of the default speckle."""
+"""Size of the default speckle [px]."""
 LEAST_SQUARES = {"gradient": "deformed", "gradient_blur_px": 0.0, "order": 5}
 BLURRED = {"gradient": "deformed", "order": 5}
 
@@ -66,9 +66,9 @@ class Row:
     width_px
         Full width at half maximum of the speckle's autocorrelation [px].
     degree
-        Of the polynomials.
+        Degree of the polynomials.
     options
-        Of the correlation, other than by default.
+        Options of the correlation that aren't the defaults.
     """
 
     in_f: float
@@ -79,7 +79,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """For the table."""
+        """Name in the table."""
         where = "both" if self.in_f and self.in_g else "f" if self.in_f else "g"
         blurred = ", deformed image's gradient, blurred" if self.options else ""
         how = ", least squares" if self.options == LEAST_SQUARES else blurred
@@ -143,20 +143,20 @@ class Motion:
 
     @property
     def came_from(self) -> tuple[FloatArray, FloatArray]:
-        """(rows, cols) x and y before the motion of what the pixels of g show [mm]."""
+        """(rows, cols) x and y before the motion of the points that the pixels of g show [mm]."""
         across, up = np.meshgrid(GRID.x, GRID.y)
         return (across - self.dx_px * PIXEL) / (1.0 + self.strain), up - self.dy_px * PIXEL
 
     @property
     def shown(self) -> NDArray[np.bool_]:
-        """(rows, cols) True on the pixels of g that show what the pixels of f compared do."""
+        """(rows, cols) True on pixels of g that show the area of the compared pixels of f."""
         inside = np.ones(GRID.shape, dtype=np.bool_)
         for at, own in zip(GRID.to_px(*self.came_from), USED, strict=True):
             inside &= (own.min() - 0.5 <= at) & (at < own.max() + 0.5)
         return inside
 
     def displacement(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """(..., 2) [mm]."""
+        """(..., 2) displacement of points x, y before the motion [mm]."""
         return np.stack([self.dx_px * PIXEL + self.strain * x, np.full_like(y, self.dy_px * PIXEL)],
                         axis=-1)  # fmt: skip
 
@@ -173,7 +173,7 @@ def motions(step: float) -> Iterator[Motion]:
 
 @lru_cache(maxsize=64)
 def speckle(width_px: float, seed: int) -> Speckle:
-    """The default speckle, finer."""
+    """The default speckle, scaled to a size of ``width_px``."""
     scale = width_px / PAPER_PX
     spec = SpeckleSpec(standard_deviation=0.05 / scale, blur_px=3.0 * scale, seed=seed)
     return Speckle(spec, GRID.shape)
@@ -181,13 +181,13 @@ def speckle(width_px: float, seed: int) -> Speckle:
 
 @lru_cache(maxsize=64)
 def slopes(width_px: float, seed: int) -> FloatArray:
-    """(2, pixels) exact slopes of f along rows and columns where it is compared [1/px]."""
+    """(2, pixels) exact derivatives of f along rows and columns at compared pixels [1/px]."""
     return np.asarray(speckle(width_px, seed).gradient(*USED))
 
 
 @lru_cache(maxsize=256)
 def moved(width_px: float, seed: int, motion: Motion) -> tuple[FloatArray, FloatArray]:
-    """Exact g, and (2, pixels) slopes before the motion where it shows what is compared [1/px]."""
+    """Exact g, and (2, pixels) derivatives before the motion at its compared pixels [1/px]."""
     pattern, came_from = speckle(width_px, seed), GRID.to_px(*motion.came_from)
     return pattern.exact(*came_from), np.asarray(
         pattern.gradient(*(at[motion.shown] for at in came_from))
@@ -203,13 +203,13 @@ class Measured:
     errors
         (pairs, 2, n) of the unknowns under n and -n.
     bounds
-        (pairs, n, n) covariances.
+        (pairs, n, n) covariances at the bound.
     predicted
-        (pairs, 2, n, n) covariances that the results give, knowing the noise.
+        (pairs, 2, n, n) covariances that the results give if the noise is known.
     efficient
         (pairs, n) errors of the efficient estimator under n.
     to_px
-        (n, n): a' to_px a is the mean square of the displacement that a means, per component.
+        (n, n): a' to_px a is the mean square displacement by unknowns a, per component [px^2].
     """
 
     errors: FloatArray
@@ -234,7 +234,7 @@ class Measured:
 
     @property
     def bias_square(self) -> float:
-        """Of the displacement's bias, without that of the scatter of its mean [px^2]."""
+        """Mean square bias of the displacement, less that by the scatter of the mean [px^2]."""
         means = self.errors.mean(axis=1)
         products = np.einsum("pi,ij,qj->pq", means, self.to_px, means)
         n = len(means)
@@ -260,7 +260,7 @@ class Measured:
 
 
 def measure(row: Row, motion: Motion, pairs: int, number: int = 0) -> Measured:
-    """Correlate all realisations under one motion, whose number makes its noise its own."""
+    """Correlate all realisations under one motion; ``number`` seeds the noise of this motion."""
     ansatz = Ansatz(Box.centred(GRID.cols * PIXEL, GRID.rows * PIXEL), v0_degree=row.degree)
     options, stretch = CorrelationOptions((FULL,), **row.options), 1.0 + motion.strain
     shown, rest = motion.shown, np.zeros(ansatz.size)
@@ -307,7 +307,7 @@ class Ratio:
 
     @classmethod
     def of(cls, above: FloatArray, below: FloatArray) -> Ratio:
-        """Of independent pairs of terms (k,)."""
+        """The ratio of the sums of independent pairs of terms (k,)."""
         value = above.sum() / below.sum()
         scatter = np.square(above - value * below).sum()
         return cls(float(value), float(np.sqrt(scatter) / below.sum()))
@@ -323,7 +323,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Summary:
-    """A row over all its motions.
+    """Results of a row over all its motions.
 
     Parameters
     ----------
@@ -346,7 +346,7 @@ class Summary:
 
 
 def summarise(row: Row, pairs: int, step: float) -> Summary:
-    """Measure a row."""
+    """Measure a row under all motions."""
     made = [measure(row, motion, pairs, number) for number, motion in enumerate(motions(step))]
     error, efficient = np.hstack([one.mean_squares for one in made])
     by_bound, by_own, expected = np.hstack([one.chi_squares for one in made])

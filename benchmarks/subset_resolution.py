@@ -1,18 +1,18 @@
-"""DIC on the star of DIC Challenge 2.0, by subsets or finite elements: theory, and what is found.
+"""Resolution and noise of DIC on the star of DIC Challenge 2.0, measured and by theory.
 
-pyvale, or whatever ``MODEHARVEST_PYVALE`` names (docs/how-to/fields.md), measures the star with
-subsets of several sizes; its fields are graded as anybody's. Theory: l10 by Savitzky and
-Golay's weights, and
+pyvale (``MODEHARVEST_PYVALE``, see docs/how-to/fields.md) measures the star with subsets of several
+sizes, and its fields are graded like any others. l10 is the period at which 10 % of a wave is lost,
+n the noise floor. Theory: l10 by Savitzky and Golay's weights, and
 
     n = sqrt(2) s / (w G),   G^2 the mean squared gradient of the speckle along y,
 
-for an affine subset of w x w px, more for a quadratic one. Both take the speckle for even. It
-isn't: a correlation weighs each pixel of a subset by its gradient ("this speckle"), which is the
-pattern-induced bias; such fits to the true displacement are graded, too.
+for an affine subset of w x w px, more for a quadratic one. Both assume an even speckle. In others a
+correlation weights each pixel of a subset by its gradient ("this speckle"), which causes the
+pattern-induced bias; such fits are graded, too. Tables: docs/explanation/resolution.md.
 
-With ``--cutoffs`` it is the whole displacement instead of subsets, for cut-off wavelengths l, or
-the one that it finds by itself in the deformed image ("found"); the image without motion is
-measured with the same. Theory of its smoothing, T = 1/(1 + (l/p)^6):
+With ``--cutoffs`` the whole displacement is measured instead, with cut-off wavelengths l, or the
+one found from the deformed image ("found"), which is also used for the image without motion. Theory
+of its smoothing, T = 1/(1 + (l/p)^6):
 
     l10 = 9^(1/6) l,    n = sqrt(2) s/(l G) sqrt(4 pi^2/(9 sqrt(3))).
 
@@ -56,7 +56,7 @@ DEGREES = {"rigid": 0, "affine": 1, "quad": 2}
 
 
 def main() -> None:
-    """Measure, grade, and set against theory."""
+    """Measure, grade, and compare with theory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--widths", type=int, nargs="+", default=[11, 17, 25])
     parser.add_argument("--shapes", nargs="+", default=["affine"], choices=list(DEGREES))
@@ -113,12 +113,12 @@ def grade(star_set: StarSet, shape: str, width: int, options: argparse.Namespace
 
 
 MARGIN_PX = 100
-"""Of rows that are measured beside those that are graded, where the body's edges are; half of it
-along the image's ends."""
+"""Rows measured beyond the graded ones, up to the body's edges; half as many columns are not
+graded at the image's ends."""
 
 
 def grade_whole(star_set: StarSet, options: argparse.Namespace) -> None:
-    """Measure the whole displacement with and without motion, and print what it resolves."""
+    """Measure the whole displacement with and without motion; print resolution and noise."""
     star = star_set.spec.star
     rows = slice(star.centre_row - options.band, star.centre_row + options.band + 1, options.step)
     row, col = np.mgrid[rows, MARGIN_PX // 2 : star.cols - MARGIN_PX // 2 : options.step]
@@ -167,7 +167,7 @@ FLOOR = float(np.sqrt(4.0 * np.pi**2 / (9.0 * np.sqrt(3.0))))
 
 
 def grade_filters(shapes: list[str], widths: list[int]) -> None:
-    """Print what grading makes of exact filters: the smoothed curve, and the Challenge's way."""
+    """Print l10 of exact filters: theory, the smoothed curve, and the Challenge's method."""
     star = Star()
     row, col = np.indices((star.rows, star.cols))
     true = star.down(row, col)
@@ -190,14 +190,14 @@ def grade_filters(shapes: list[str], widths: list[int]) -> None:
 
 
 def subset_transfer(width: int, degree: int, period: FloatArray) -> FloatArray:
-    """(...) T of a subset for waves along one of its edges, read at its centre [-]."""
+    """(...) T at the centre of a subset, for waves along one of its edges [-]."""
     offsets = np.arange(width) - width // 2
     phase = 2.0 * np.pi * offsets / np.asarray(period)[..., None]
     return np.asarray(np.cos(phase) @ savgol_coeffs(width, degree))
 
 
 def subset_noise(width: int, degree: int) -> float:
-    """Noise floor of a subset's centre on even speckle, over sqrt(2) s / G [1/px]."""
+    """Noise floor at the centre of a subset on even speckle, over sqrt(2) s / G [1/px]."""
     t = np.linspace(-1.0, 1.0, width)
     x, y = (a.ravel() for a in np.meshgrid(t, t))
     basis = np.stack([x**i * y**j for i, j in orders(degree)], axis=-1)
@@ -213,10 +213,10 @@ def slopes(star_set: StarSet) -> FloatArray:
 
 
 def weighted(star_set: StarSet, degree: int, width: int, at: LocalField) -> LocalField:
-    """Fits of a subset's shape functions to the true displacement, weighted by the speckle's slope.
+    """Fits of a subset's shape functions to the true displacement, weighted by the gradient.
 
-    What Gauss and Newton's matrix J'J makes of it at the points of a field, with the standard
-    deviations of v for a noise of 1 in one image.
+    The normal equations of Gauss and Newton at the points of a field, with the standard deviations
+    of v for a noise of 1 in one image.
     """
     star, half = star_set.spec.star, width // 2
     g_y, g_x = slopes(star_set)
@@ -240,12 +240,12 @@ def weighted(star_set: StarSet, degree: int, width: int, at: LocalField) -> Loca
 
 
 def _rounding(star_set: StarSet) -> float:
-    """Standard deviation of what rounding to so many bits does, of full scale."""
+    """Standard deviation of rounding to the set's number of bits [of full scale]."""
     return float(1.0 / np.sqrt(12.0) / (2**star_set.spec.bits - 1))
 
 
 def row(star_set: StarSet, shape: str, width: int, noise: float, graded: StarGrade) -> str:
-    """A row of the table."""
+    """A row of the table of subsets."""
     star, degree = star_set.spec.star, DEGREES[shape]
     finest = finest_period(lambda p: subset_transfer(width, degree, p), 4.0, 2000.0)
     fitted = weighted(star_set, degree, width, graded.moved)

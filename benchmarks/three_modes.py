@@ -1,18 +1,18 @@
-"""Three free modes in triangular stacking: how often they settle, how near to the best fit.
+"""Three free modes in triangular stacking: convergence, and distance from the best fit.
 
 Two kinds of truth, both by finite elements, each imaged with several speckles and correlated with
 the three families of the zone's boundary, all their parameters free:
 
 * "flower": the lattice under equibiaxial compression, on the branch on which all three modes are
-  equally strong; a specimen is cut out of it, without edges that would hold it.
-* "plates": a specimen compressed along its rows between clamped edges, as an ``Experiment`` does
-  it. Two of the three modes appear, as they do in the lattice, in specimens that are much higher
-  than long: others bulge sideways, and show none.
+  equally strong; a specimen is cut out of it, without edges that would restrain it.
+* "plates": a specimen compressed along its rows between clamped edges, as by an ``Experiment``. Two
+  of the three modes appear, as in the lattice, in specimens that are much higher than long; others
+  bulge sideways, and show none.
 
-A row: holes; degree of v_i; unknowns; strain; correlations that converged; rms of the three modes
-v_i phi_i and of w at the best fit, and of IDIC from it [px]; the largest error of a wave vector, by
-the best fit [pi/l], of modes that are observable (v_i phi_i at least twice w), and of those that
-aren't, with their number. Other numbers are medians over the speckles.
+Columns: holes; degree of v_i; unknowns; strain; correlations that converged; rms length of v_i
+phi_i and of w at the best fit, and of IDIC's distance from it [px]; the largest error of wave
+vectors against it [pi/l], of observable modes (v_i phi_i at least twice w) and others, with their
+number. Other numbers are medians over the speckles. Table: docs/explanation/three_modes.md.
 
 Run: scripts/env python benchmarks/three_modes.py [--quick]
 """
@@ -51,13 +51,12 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 
 PITCH, DIAMETER, MESH_SIZE = 1.9, 1.7, 0.35
-SIZES = [(3, 3), (4, 5), (5, 6), (6, 7), (8, 9), (10, 12)]
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One correlation with three free modes, beside the best fit."""
+    """One correlation with three free modes, compared with the best fit."""
 
     converged: bool
     modes_px: tuple[float, ...]
@@ -66,16 +65,16 @@ class Measured:
     idic_px: float
     """Rms of the best fit from the truth, and of IDIC from the best fit [px]."""
     wave_errors: tuple[float, ...]
-    """Of the modes' wave vectors, IDIC from the best fit [pi/l]."""
+    """Distances of the modes' wave vectors from the best fit's [pi/l]."""
 
     @property
     def is_observable(self) -> tuple[bool, ...]:
-        """Whether each mode is strong enough for its parameters to mean anything."""
+        """Whether each mode is strong enough for its parameters to be meaningful."""
         return tuple(size >= OBSERVABLE * self.w_px for size in self.modes_px)
 
 
 def flowers(specimens: Sequence[Specimen], strain: float) -> Iterator[Solution]:
-    """Specimens cut out of the infinite lattice with all three modes."""
+    """Specimens cut out of the infinite lattice on the branch of all three modes."""
     cell = hexagonal(PITCH, DIAMETER, MESH_SIZE)
     body = PeriodicCell(cell, Ogden())
     critical = first_critical(CellPath(body, equibiaxial()))
@@ -125,7 +124,7 @@ def measured(pair: ImagePair, specimen: Specimen, degree: int) -> Measured:
 
 
 def row(solution: Solution, specimen: Specimen, degree: int, seeds: int, pixel: float) -> str:
-    """Images with several speckles, correlated: a row of the table."""
+    """Correlate images with several speckles; returns a row of the table."""
     found = []
     for seed in range(seeds):
         spec = ImagingSpec(pixel_size=pixel, speckle=SpeckleSpec(seed=seed))

@@ -1,14 +1,14 @@
 """Coverage of the twin's 95 % intervals over many seeds of the camera's noise.
 
-Each seed photographs the twin again: a 95 % interval of a field, 1.96 standard deviations by noise
-about what one photograph shows, should hold the noise-free result in 95 of 100 of them. With
---whole-field the whole displacement is measured in each, and its intervals, which count noise and
-smoothing, should hold the truth: those of u at the pixels of the material, and those of the
-ansatz refitted to it the ansatz' best fit to the truth. What smoothing and edges make of u depends
-on the speckle: with --speckles each seed has a speckle and masks of its own, not only noise.
+Each seed photographs the twin again. A 95 % interval of a field, 1.96 standard deviations by noise
+about the result of a photograph, should hold the noise-free result in 95 of 100
+(docs/how-to/harvest.md). With --whole-field the whole displacement is measured in each; intervals
+of u, by noise and smoothing, should hold the truth, and those of the refitted ansatz its best fit
+to the truth. With --speckles each seed also has its own speckle and masks, because the effects of
+smoothing and of edges depend on the speckle (docs/explanation/whole_field_accuracy.md).
 
-Needs the twin's photographs and harvest (minutes), which it makes in out/twin unless they are
-there: modeharvest run paper-real-twin --out out/twin. Goes on where it was stopped.
+Needs the twin's photographs and harvest (minutes), which it makes in out/twin unless they exist:
+modeharvest run paper-real-twin --out out/twin. It continues where it was stopped.
 
 Run: scripts/env python benchmarks/twin_coverage.py [--seeds 100] [--workers 2] [--folder out/twin]
      [--name deformed_1270] [--whole-field | --speckles]
@@ -88,10 +88,10 @@ def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
 
 
 def one_whole(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
-    """Photograph once more and measure the whole displacement, against the truth.
+    """Photograph once more, measure the whole displacement, and compare it with the truth.
 
-    For the rest see :func:`one_seed`. Returns errors [px], the cut-off wavelength, the share of
-    pixels, points and parameters covered, and the rms error over its standard deviation.
+    For the parameters see :func:`one_seed`. Returns errors [px], the cut-off wavelength, the share
+    of pixels, points and parameters covered, and the rms error over its standard deviation.
     """
     setup = _setup(folder, case["name"])
     return _whole(setup, setup.pair.with_images(*setup.photographs(case["seed"])))
@@ -106,7 +106,7 @@ def one_speckle(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
 
 
 def _whole(setup: _CoverageSetup, pair: ImagePair) -> dict[str, float]:
-    """Measure the whole displacement of a pair, and set it against the truth."""
+    """Measure the whole displacement of a pair, and compare it with the truth."""
     (body, how), start = setup.harvesting._mesh, setup.start
     known, a = start.ansatz, start.unknowns
     gain, offset = known.gain_and_offset(a, pair.grid.x, pair.grid.y)
@@ -142,7 +142,7 @@ def _whole(setup: _CoverageSetup, pair: ImagePair) -> dict[str, float]:
 
 
 def _shares(parts: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, float]:
-    """Of each part's deviations the share within intervals, and the rms in standard deviations."""
+    """Share of each part's deviations within intervals, and their rms in standard deviations."""
     shares = {}
     for name, (deviation, error) in parts.items():
         ratio = deviation[error > 0] / error[error > 0]
@@ -153,7 +153,7 @@ def _shares(parts: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, flo
 
 @dataclass(frozen=True, eq=False)
 class _CoverageSetup:
-    """All that does not depend on the seed: what a worker keeps."""
+    """Data that do not depend on the seed, which a worker keeps."""
 
     twin: Twin
     harvesting: HarvestRun
@@ -167,7 +167,7 @@ class _CoverageSetup:
 
     @property
     def strain(self) -> float:
-        """The nominal strain that the name tells."""
+        """The nominal strain in the photograph's name [-]."""
         of_name = int(self.name.rsplit("_", 1)[1]) / 1e4
         return min(self.twin.images.strains, key=lambda e: abs(e - of_name))
 
@@ -185,14 +185,14 @@ class _CoverageSetup:
     def best(self) -> Result:
         """The best fit of the ansatz to the truth, at the pixels of the mask.
 
-        At the ideal mask's it is another by some 0.01 px, because the ansatz doesn't describe w.
+        With the ideal mask it differs by some 0.01 px, because the ansatz doesn't describe w.
         """
         start = self.start
         return fit_displacement(self.true, start.grid, start.ansatz, start.unknowns, self.mask)
 
     @cached_property
     def clean(self) -> Result:
-        """What photographs without noise show."""
+        """The result of photographs without noise."""
         return self.measured(self.photographs(None))
 
     def photographs(self, seed: int | None) -> tuple[FloatImage, FloatImage]:
@@ -215,7 +215,7 @@ class _CoverageSetup:
         return taken[0], taken[1]
 
     def with_speckle(self, seed: int, folder: Path) -> _CoverageSetup:
-        """Another speckle and another noise on the same specimen, its masks found anew."""
+        """The same specimen with another speckle, other noise, and masks found anew."""
         case, images = Case.read("paper-real-twin"), self.twin.images
         speckle, sensor = images.spec.speckle, images.spec.sensor
         assert speckle.ink is not None
@@ -234,7 +234,7 @@ class _CoverageSetup:
         return replace(self, twin=twin, harvesting=HarvestRun(photographs, folder / "harvest"))
 
     def measured(self, images: tuple[FloatImage, FloatImage]) -> Result:
-        """Correlate as the harvest finished, from the harvest's result on."""
+        """Correlate with the last level of the harvest, starting from its result."""
         options = self.harvesting.case.correlation.options()
         finest = replace(options, levels=options.levels[-1:], final_smoothing_px=self.blur_px)
         pair, start = self.pair.with_images(*images), self.start

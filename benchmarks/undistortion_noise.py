@@ -1,10 +1,10 @@
-"""What it costs to resample noisy images once, before they are correlated.
+"""Effect of resampling noisy images once before their correlation.
 
 Monte Carlo over noise: images of an exactly known motion, with a perfect lens, or seen through a
-lens and resampled (`undistorted`), correlated with an ansatz that holds the motion. Reported: the
-mean error of the displacement, its scatter and what the engine predicts from the camera's noise
-(rms over the image [px]), and the residual's variance over that of the noise in both images. The
-same once more with both images blurred by 0.7 px before.
+lens and resampled (`undistorted`), are correlated with an ansatz that holds the motion. Printed are
+the mean error of the displacement, its scatter, and the prediction from the camera's noise (rms
+over the image [px]), and the residual's variance over that of the noise in both images; then the
+same with both images blurred by 0.7 px. Table: docs/decisions/0006-distortion.md.
 
 Run: scripts/env python benchmarks/undistortion_noise.py
 """
@@ -38,7 +38,7 @@ MARGIN = 50
 
 
 def moved_back(unknowns: FloatArray, row: FloatArray, col: FloatArray) -> tuple[FloatArray, ...]:
-    """The points that the motion brings to (row, col), by fixed-point iteration."""
+    """The points that the motion brings to (row, col) [px], by fixed-point iteration."""
     at_row, at_col = row, col
     for _ in range(60):
         x, y = GRID.to_mm(at_row, at_col)
@@ -57,7 +57,7 @@ def exact_pair(unknowns: FloatArray, lens: CameraDistortion | None) -> tuple[Flo
 
 
 def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: float) -> str:
-    """Repeat a measurement with other noise, and sum it up."""
+    """Repeat a measurement with other noise; returns a row of the table."""
     unknowns = np.random.default_rng(1).normal(0.0, size_mm, ANSATZ.size)
     images = exact_pair(unknowns, lens)
     mask = np.zeros(GRID.shape, dtype=np.bool_)
@@ -80,7 +80,7 @@ def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: flo
     truth = ANSATZ.displacement(unknowns, x, y) / GRID.pixel_size
     mean_error = np.sqrt(np.mean((fields.mean(axis=0) - truth) ** 2))
     scatter = np.sqrt(np.mean(fields.var(axis=0, ddof=1)))
-    # The engine predicts for white noise; blurred, it isn't.
+    # The prediction is for white noise; blurred noise isn't.
     sd = field_errors(result, x, y, result.covariance(noise)).displacement
     predicted = np.sqrt(np.mean(sd**2)) / GRID.pixel_size
     words = "" if blur > 0.0 else f"{predicted:.4f}"
@@ -92,11 +92,11 @@ def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: flo
 
 
 def undistorted_noise(order: int = 5) -> tuple[float, float]:
-    """Variance of white noise of variance 1 in an undistorted image, and where that is sampled.
+    """Variance of white noise of variance 1 in an undistorted image, and after sampling that again.
 
-    The residual of a correlation of two undistorted images holds the first of f and the second of
-    g: its variance is their sum times that of the camera's noise. The unknowns see slower waves,
-    of which no noise is lost: their covariance is that of the camera's noise itself.
+    The residual of two undistorted images has the first in f and the second in g: its variance is
+    their sum times that of the camera's noise. The unknowns depend on longer waves, of which no
+    noise is lost: their covariance is that of the camera's noise itself.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def undistorted_noise(order: int = 5) -> tuple[float, float]:
     """
     _, correlations = sampled_correlations(0.0, order, 1.0)
     once = float(correlations.max())
-    # Sampling noise with correlations R at a phase that is anything: sum over lags of R R.
+    # Noise with correlations R, sampled at any phase: sum over lags of R R.
     return once**2, float((correlations**2).sum()) ** 2
 
 

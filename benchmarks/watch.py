@@ -1,16 +1,16 @@
-"""A test that is watched: seconds a photograph, and the strain of buckling before it comes.
+"""Watching a test: time per photograph, and prediction of the strain of buckling.
 
 scripts/env python benchmarks/watch.py            # predictions, 32 seeds
 scripts/env python benchmarks/watch.py --step 0.01 --last 0.7    # a photograph every hundredth
-scripts/env python benchmarks/watch.py --time     # seconds a photograph of 3 Mpx
-scripts/env python benchmarks/watch.py --memory harvest 20 200    # peak of so many photographs
+scripts/env python benchmarks/watch.py --time     # time per photograph of 3 Mpx
+scripts/env python benchmarks/watch.py --memory harvest 20 200    # peak memory by photographs
 scripts/env python benchmarks/watch.py --memory measure 20
 scripts/env python benchmarks/watch.py --seeds 1 --picture docs/images/watch.png
 
-Specimens of the paper's kind, 6 x 10 holes scattered by 0.01 mm in place and diameter, simulated at
-strains up to 0.95 of their own critical strains, photographed with 3 Mpx, 8 bits and noise
-of 1 %, and measured as `modeharvest harvest --watch` does; scatter, speckle and noise are each
-seed's own. docs/how-to/sequences.md has the numbers.
+Specimens of the paper's kind, 6 x 10 holes with a scatter of 0.01 mm in position and diameter, are
+simulated at strains up to 0.95 of their own critical strains, photographed with 3 Mpx, 8 bits and
+noise of 1 %, and measured as by `modeharvest harvest --watch`. Scatter, speckle and noise differ
+for each seed. Results: docs/how-to/sequences.md.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.growth import follow_growth
 
 LAST = 0.95
-"""Of a specimen's own critical strain, up to which photographs are taken."""
+"""Strain up to which photographs are taken, over the specimen's own critical strain [-]."""
 PIXEL_SIZE = 0.0107
-"""Of 3.14 Mpx [mm]."""
+"""Pixel size of images of 3.14 Mpx [mm]."""
 ASKED = (0.5, 0.6, 0.7, 0.8, 0.9)
 
 
 def solved(experiment: Experiment, path: Path) -> Solution:
-    """A solution, computed once."""
+    """The solution of an experiment, computed once and kept in a file."""
     from modeharvest.fem.simulate import simulate
 
     if not path.is_file():
@@ -63,7 +63,7 @@ def solved(experiment: Experiment, path: Path) -> Solution:
 
 
 def photographed(solution: Solution, folder: Path, pixel_size: float, seed: int) -> Path:
-    """Photographs of all states, of a speckle and noise by a seed; the experiment's TOML file."""
+    """Photograph all states with a seed's speckle and noise; the experiment's TOML file."""
     spec = ImagingSpec(
         pixel_size, speckle=SpeckleSpec(seed=seed), sensor=Sensor(read_noise=0.01, read_seed=seed)
     )
@@ -84,10 +84,10 @@ def photographed(solution: Solution, folder: Path, pixel_size: float, seed: int)
 
 
 def critical_strain(experiment: Experiment) -> float:
-    """At which a specimen would buckle whose holes are the mean of this one's four mirror images.
+    """Critical strain of a specimen whose holes are the mean of this one's four mirror images [-].
 
-    That has a bifurcation, and where it is differs from where this one's growth points to only by
-    the square of the scatter: mirrors turn the critical mode over, of which its eigenvalue is even.
+    It has a bifurcation. To first order in the scatter, its strain is that to which this one's
+    growth points, because mirroring reverses the critical mode but not its eigenvalue.
     """
     from modeharvest.fem.meshing import hole_motion, mesh_specimen
     from modeharvest.fem.path.parametric import ParametricTest
@@ -101,20 +101,20 @@ def critical_strain(experiment: Experiment) -> float:
     moved = hole_motion(mesh.nodes, spec, holes.reshape(-1, holes.shape[2]))
     perfect = replace(experiment, imperfection=Imperfection(), strains=experiment.strains[-1:])
     test = ParametricTest(perfect, (), replace(mesh, nodes=mesh.nodes + moved))
-    test.with_critical = True  # beyond the strains, too
+    test.with_critical = True  # also beyond the strains
     test.at(np.zeros(0), with_derivatives=False)
     assert test.critical_strain is not None
     return test.critical_strain
 
 
 def watched(experiment: Path) -> list[dict[str, float]]:
-    """Every photograph, measured in turn."""
+    """Measure every photograph in turn."""
     measuring = QuickMeasurement(PhotographCase.read(experiment))
     return [measuring.measure(path) for path in sorted((experiment.parent / "shots").iterdir())]
 
 
 def small_photographs(folder: Path, count: int) -> Path:
-    """A reference and so many states of 300 x 300 px, compressed by up to 4 %."""
+    """Make a reference and ``count`` states of 300 x 300 px, compressed by up to 4 %."""
     shots, pixel, l = folder / "shots", 0.035, 1.9  # noqa: E741
     shots.mkdir(parents=True, exist_ok=True)
     grid = PixelGrid.centred(300, 300, pixel)
@@ -139,7 +139,7 @@ def small_photographs(folder: Path, count: int) -> Path:
 
 
 def peak(command: str, count: int, folder: Path) -> float:
-    """MB that harvesting or measuring so many photographs takes at most."""
+    """Peak memory of harvesting or measuring ``count`` photographs [MiB]."""
     experiment = small_photographs(folder, count)
     what = [str(experiment)]
     if command == "measure":
@@ -157,7 +157,7 @@ def peak(command: str, count: int, folder: Path) -> float:
 
 
 def draw(rows: list[dict[str, float]], path: Path) -> None:
-    """Draw what the page shows of a test."""
+    """Draw the figure of docs/how-to/sequences.md for one test."""
     test = WatchedTest(rows)
     last = test.predictions[-1]
     assert last
@@ -174,12 +174,12 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
 
 
 def least_deviation(columns: FloatArray, imperfection: float, critical: float) -> float:
-    """Least standard deviation of any unbiased prediction, of the critical load (Cramér–Rao).
+    """Least standard deviation of any unbiased prediction, over the critical load (Cramér–Rao).
 
-    ``columns`` (4, n): load, amplitude and its standard deviations, by noise, half of whose
-    variance all images have in common, and by model error. The linear part is expected to be 0 +-
-    0.15 of what the imperfection gives and the latter, the quadratic one the latter, as in
-    ``validation/growth.py``.
+    ``columns`` (4, n): load, amplitude, and its standard deviations by noise (half of this variance
+    is common to all images) and by model error. Priors are 0 +- 0.15 of the imperfection's part,
+    and the model error, for the linear part, and the model error for the quadratic one
+    (``validation/growth.py``).
     """
     load, _, sd, model = columns
     ahead, a0 = critical - load, abs(imperfection)
@@ -193,13 +193,13 @@ def least_deviation(columns: FloatArray, imperfection: float, critical: float) -
 
 
 def print_memory(command: str, counts: Iterable[int]) -> None:
-    """Print the peak memory of so many photographs, and the time of each."""
+    """Print peak memory, and time per photograph, for each count of photographs."""
     for count in counts:
         with tempfile.TemporaryDirectory() as folder:
             begin = time.perf_counter()
             most = peak(command, count, Path(folder))
             took = (time.perf_counter() - begin) / count
-        print(f"{command}, {count} photographs: {most:.0f} MB, {took:.1f} s each", flush=True)
+        print(f"{command}, {count} photographs: {most:.0f} MiB, {took:.1f} s each", flush=True)
 
 
 def print_times(strains: Sequence[float], out: Path) -> None:
@@ -217,7 +217,7 @@ def print_times(strains: Sequence[float], out: Path) -> None:
 
 
 def measured(experiment: Experiment, seed: int, kept: Path) -> list[dict[str, float]]:
-    """What is measured of an experiment's photographs; a second run has it at once."""
+    """Measure an experiment's photographs; the result is kept in a file for the next run."""
     if not kept.is_file():
         solution = solved(experiment, kept.with_suffix(".h5"))
         rows = watched(photographed(solution, kept.with_suffix(""), PIXEL_SIZE, seed))
@@ -226,19 +226,19 @@ def measured(experiment: Experiment, seed: int, kept: Path) -> list[dict[str, fl
 
 
 class Checked(NamedTuple):
-    """A prediction made at a share of the critical load, against what happened."""
+    """A prediction at a share of the critical load, compared with the true critical load."""
 
     share: float
     error: float
-    """Of the critical load [-]."""
+    """Relative error of the critical load [-]."""
     holds: bool
-    """Its interval."""
+    """Whether its 95 % interval holds."""
     is_useful: bool
     text: str
 
 
 def checked(columns: FloatArray, there: float, shares: FloatArray) -> Iterator[Checked]:
-    """The predictions at the shares asked for, buckling coming at the load ``there``."""
+    """Predictions at the shares ``ASKED`` of the true critical load ``there``."""
     predictions = follow_growth(columns)
     for share in ASKED:
         at = predictions[int(np.flatnonzero(share + 1e-6 >= shares)[-1])]
@@ -251,7 +251,7 @@ def checked(columns: FloatArray, there: float, shares: FloatArray) -> Iterator[C
 
 
 def print_shares(found: Sequence[Checked], seeds: int) -> None:
-    """Print how good predictions are, by the load they were made at."""
+    """Print errors and coverage of predictions, by the load at which they were made."""
     for share in sorted({f.share for f in found}):
         _, off, holds, useful, _ = (
             np.array(of) for of in zip(*(f for f in found if f.share == share), strict=True)
@@ -297,7 +297,7 @@ def main() -> None:
         if seed == 1 and given.picture is not None:
             draw(rows[: int((shares < 0.71).sum())], given.picture)
         columns = WatchedTest(rows).columns
-        # What is measured is the strain of the cellular part, without the bulk at its edges.
+        # The measured strain is that of the cellular part, without the bulk at its edges.
         there = float(np.polyval(np.polyfit(strains, columns[0], 2), critical))
         own = list(checked(columns, there, shares))
         found += own

@@ -1,14 +1,14 @@
-"""How often 95 % intervals of the whole displacement, and of its strains, hold the truth.
+"""Coverage of 95 % intervals of the whole displacement, its strains and the refitted ansatz.
 
-A small specimen (3 x 4 holes, d/l 0.79, 13 %, 0.02 mm/px), every seed with a speckle pattern and
-with noise of its own; 8-bit images and such with 1 and 2 % of noise. Over all pixels of the
-material, and within 10 px of its edges: the share of components of u and of the Green-Lagrange
-strain in their intervals, mean and standard deviation over the seeds, the least of any seed; and
-the rms error over the rms standard deviation. Every measurement starts at the best fit of the
-ansatz. The truth's strain is that of its finite elements, a fifth as long as those of the
-measurement, averaged around their nodes. Of the ansatz refitted to u, the intervals of v0, v1 and
-phi1's parameters are set against the best fit to the truth. Seeds are shared out among processes,
-and kept: goes on where it was stopped, or with more seeds.
+A small specimen (3 x 4 holes, d/l 0.79, 13 %, 0.02 mm/px), each seed with its own speckle and
+noise; 8-bit images and images with 1 and 2 % of noise. Over all pixels of the material, and within
+10 px of its edges: rms error and rms standard deviation of u and of the Green-Lagrange strain, and
+the share of components in their intervals (mean and standard deviation over the seeds, least of any
+seed). Every measurement starts at the best fit of the ansatz. The true strain is that of the
+truth's finite elements, a fifth as long as those of the measurement, averaged around their nodes.
+Intervals of v0, v1 and phi1's parameters, of the ansatz refitted to u, are compared with the best
+fit to the truth. Seeds are distributed among processes and kept: a run continues where it was
+stopped, or with more seeds. Tables: docs/explanation/whole_field_intervals.md.
 
 Run: scripts/env python benchmarks/whole_coverage.py [--seeds 30] [--noise 0 0.01 0.02]
      [--workers 2] [--folder out/whole_coverage]
@@ -57,12 +57,12 @@ NAME, PIXEL = "square, d/l 0.79", 0.02
 STRAINS = "xx", "yy", "xy"
 NORMAL_95 = 1.959964
 POINTS = 15
-"""Along each side of the cellular part, at which v0 and v1 are looked at."""
+"""Points along each side of the cellular part at which v0 and v1 are compared."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Of one seed, for u and for each strain: over all pixels, and at edges."""
+    """Results of one seed, for u and for each strain: over all pixels, and at edges."""
 
     noise: float
     seed: int
@@ -126,7 +126,7 @@ def true_strain(solution: Solution, grid: PixelGrid) -> FloatArray:
 
 
 def measured(pair: ImagePair, specimen: Specimen, true: FloatArray, noise: float, seed: int) -> Row:
-    """Measure, and set u and strains against the truth."""
+    """Measure, and compare u and strains with the truth."""
     assert pair.truth is not None
     ansatz = Ansatz.of_specimen(specimen, options=AnsatzOptions(4, 3))
     guess = ansatz.initial_guess(pair.strain)
@@ -154,7 +154,7 @@ def measured(pair: ImagePair, specimen: Specimen, true: FloatArray, noise: float
 
 
 def refitted_against(best: Result, refit: Result) -> dict[str, tuple[float, float]]:
-    """Of v0, v1 and phi1, the share in 95 % intervals and the rms error over its sd."""
+    """Share of v0, v1 and phi1 in 95 % intervals, and their rms error over its sd."""
     known, box = refit.ansatz, refit.ansatz.modes[0].taper.cellular
     x, y = np.linspace(box.x_min, box.x_max, POINTS), np.linspace(box.y_min, box.y_max, POINTS)
     sd, own = field_errors(refit, x, y, refit.covariance()), known.phi_slice(0)
@@ -171,7 +171,7 @@ def refitted_against(best: Result, refit: Result) -> dict[str, tuple[float, floa
 
 
 def table(rows: list[Row]) -> None:
-    """Print the document's table."""
+    """Print the table of displacements and strains."""
     print(
         "| images | of | rms error, all / edges | rms bar | 95 % intervals hold, all | at edges |"
     )
@@ -197,7 +197,7 @@ def table(rows: list[Row]) -> None:
 
 
 def refit_table(rows: list[Row]) -> None:
-    """Print the document's table of the refitted ansatz."""
+    """Print the table of the refitted ansatz."""
     print("\n| images | of the refitted ansatz | 95 % intervals hold | rms error / its sd |")
     print("|---" * 4 + "|")
     for noise in sorted({row.noise for row in rows}):

@@ -1,19 +1,19 @@
-"""What the longest errors of the whole displacement are made of, pixel by pixel.
+"""Causes of the longest errors of the whole displacement, pixel by pixel.
 
 On the images of a virtual experiment (``modeharvest run paper-virtual --out FOLDER``), without and
 with noise. The error at a pixel is the sum of
 
 - mesh: the best fit of the elements to the truth over all pixels, less the truth;
-- smoothing: what the regularisation takes away of that fit, A^-1 lambda R (u_0 - u), and what of
-  that is put back;
-- images: what else exact images leave at the same cut-off wavelength: splines between pixels,
-  pixels continued beyond edges, what is known of free edges, steps that are not linear;
-- noise: what camera images leave more, by quantisation or noise.
+- smoothing: what the regularisation removes from that fit, A^-1 lambda R (u_0 - u), less the part
+  that is added back;
+- images: other errors with exact images at the same cut-off wavelength: splines between pixels,
+  pixels continued beyond edges, conditions of free edges, steps that are not linear;
+- noise: additional errors with camera images, by quantisation or noise.
 
-Printed are, for each cause and for all of them, the rms per component at edges, the longest vector
-and the number of pixels with more than 0.3 and 0.5 px; and the pixels with the longest errors, one
-for each place: where they are, how far inside the mask and whether in the mesh, the principal
-stretches there, and their errors along x and y by cause.
+Printed for each cause and for all of them are the rms per component (all, edges), the longest error
+and the number of pixels with more than 0.3 and 0.5 px; then the pixels with the longest errors, one
+for each place: position, depth in the mask, whether in the mesh, principal stretches, and errors
+along x and y by cause. Table: docs/explanation/whole_field_accuracy.md.
 
 Run: scripts/env python benchmarks/whole_edges.py FOLDER [--strain 0.128] [--noise 0 0.01]
      [--mesh mask|specimen] [--element 24 12] [--places 12]
@@ -45,7 +45,7 @@ from modeharvest.util.elements import shape_functions
 
 EDGE_PX, LONG_PX = 10, (0.3, 0.5)
 APART_PX = 40
-"""Of places: closer pixels with long errors are one."""
+"""Pixels with long errors that are closer than this are one place [px]."""
 
 
 def main() -> None:
@@ -127,14 +127,14 @@ def fitted(true: FloatArray, pair: ImagePair, body: Body, like: NodalResult) -> 
     blocks[:, 2] = blocks[:, 0]
     M, R = body.matrix(blocks), body.smoothness
     u = like.displacement.ravel()
-    # As little smoothness as determines nodes that have no pixels.
+    # The least smoothness that determines nodes without pixels.
     weight = 1e-9 * body.energies(M) / body.energies(R)
     step = body.factor(M, R, weight).solve(body.vector(right) - M @ u)
     return (u + step).reshape(-1, 2)
 
 
 def show(parts: dict[str, FloatArray], pair: ImagePair, mesh: Mesh, places: int) -> None:
-    """Print sizes by cause, and the places of the longest errors."""
+    """Print errors by cause, and the places of the longest errors."""
     mask = pair.masks[0]
     depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     edges = mask & (depth <= EDGE_PX)

@@ -1,21 +1,21 @@
-"""The whole displacement by finite-element DIC against the truth, up to the edges of the holes.
+"""Errors of the whole displacement by finite-element DIC, up to the edges of the holes.
 
 On the images of a virtual experiment (``modeharvest run paper-virtual --out FOLDER``), at every
-noise: the rms error per component of all material pixels, within 10 px of an edge, of ligaments
-and of the bulk; the longest error; how far the unknowns refitted to the measured displacement are
-from the best fit; how often 95 % intervals hold the truth; the cut-off wavelength that was found,
-and what others would have left.
+noise (0: 8-bit images, below 0: exact ones): the rms error per component over all material, within
+10 px of edges, in ligaments and in the bulk; the longest error; the rms distance of the refitted
+ansatz from the best fit; coverage of 95 % intervals; the cut-off wavelength that is found, and the
+errors with --others times that. Tables: docs/explanation/whole_field_accuracy.md.
 
 Run: scripts/env python benchmarks/whole_field.py FOLDER [--strain 0.128] [--noise 0 0.01 0.02]
      [--seeds 1] [--mesh mask|specimen] [--law right …] [--element 24 12] [--others 0.7 1.4 2]
      [--window 880 1400 560 840] [--no-free-edges] [--json FILE]
 
-A window, rows and columns from and to, is measured alone, as if nothing else were known of the
-body, in seconds; errors are counted 15 px inside. --no-free-edges measures without what free edges
-have in common.
+--window measures a part alone (first and last row, first and last column), as if the rest of the
+body were unknown, in seconds; errors are counted 15 px inside. --no-free-edges doesn't use the
+conditions of free edges.
 
-Laws are the truth's own and wrong ones; of the free edges' nodes the share that contradicts the law
-is said, and with * that the measurement warns of it.
+--law uses the truth's own law or wrong ones (docs/explanation/whole_field_laws.md). Printed is the
+share of components at nodes of free edges that contradict it, with * if a warning is given.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from modeharvest.imaging.pair import ImagePair, Truth
 
 EDGE_PX = 10
 MARGIN_PX, INSIDE_PX = 90, 15
-"""Around a window, and from its border to where errors are counted."""
+"""Margin around a window, and from its border to where errors are counted [px]."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ LAWS: dict[str, Callable[[Ogden], Any]] = {
     "neo-Hookean": lambda own: NeoHookean(0.5 * own.moduli[0], own.kappa),
     "nu-20%": lambda own: replace(own, kappa=_softer(0.36, 0.5 * own.moduli[0])),
 }
-"""From the truth's own, which has nu = 0.45."""
+"""Laws made from the truth's own, which has nu = 0.45."""
 
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Where errors are counted: (rows, cols) each."""
+    """Regions where errors are counted, each (rows, cols)."""
 
     all: NDArray[np.bool_]
     edges: NDArray[np.bool_]
@@ -90,10 +90,10 @@ class Regions:
 
     @classmethod
     def of(cls, pair: ImagePair, specimen: Specimen) -> Regions:
-        """Of a specimen whose middle is the origin."""
+        """Regions of a specimen that is centred at the origin."""
         mask = pair.masks[0]
         edges = mask & (ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] <= EDGE_PX)
-        if pair.truth is not None:  # which is that of a part alone in a window
+        if pair.truth is not None:  # known in a part alone, with a window
             mask = mask & np.isfinite(pair.truth.displacement[..., 0])
             edges &= mask
         a, b = specimen.cellular_half_size
@@ -103,7 +103,7 @@ class Regions:
 
 @dataclass(frozen=True)
 class Row:
-    """Errors of one measurement [px]; of vectors, per component."""
+    """Errors of one measurement [px]; rms per component, ``longest`` of vectors."""
 
     noise: float
     seed: int
@@ -166,13 +166,13 @@ def main() -> None:
 
 
 def specimen_of(images: ImageSet) -> Specimen:
-    """The specimen that the images show."""
+    """The specimen in the images."""
     table: dict[str, Any] = dict(images.info["solution"]["specimen"])
     return Specimen(**table)
 
 
 def law_of(images: ImageSet, name: str) -> Law:
-    """One of ``LAWS``; the ends along x are loaded."""
+    """One of ``LAWS``, with loaded ends along x."""
     grid, mask = images.grid, images.mask()
     ends = grid.x[np.flatnonzero(mask.any(axis=0))[[0, -1]]] + [-0.5, 0.5] * np.array(
         grid.pixel_size
@@ -188,7 +188,7 @@ def law_of(images: ImageSet, name: str) -> Law:
 
 
 def noisy(images: ImageSet, strain: float, noise: float, seed: int) -> ImagePair:
-    """8-bit images; exact ones, with noise < 0; or with white noise, a fraction of full scale."""
+    """Images with white noise [of full scale]; 8-bit ones with noise = 0, exact ones below."""
     pair = images.pair(strain, camera=noise == 0.0)
     if noise <= 0.0:
         return pair
@@ -201,7 +201,7 @@ def noisy(images: ImageSet, strain: float, noise: float, seed: int) -> ImagePair
 
 
 def windowed(pair: ImagePair, top: int, bottom: int, left: int, right: int) -> ImagePair:
-    """A part of the images, whose mask is that of a window in it."""
+    """A part of the images around a window, with the mask of the window."""
     grid, truth, mask = pair.grid, pair.truth, np.zeros(pair.grid.shape, dtype=np.bool_)
     assert truth is not None
     mask[top:bottom, left:right] = pair.masks[0][top:bottom, left:right]
@@ -221,7 +221,7 @@ def measured(
     pair: ImagePair, start: Result, best: Result | None, specimen: Specimen, noise: float,
     seed: int, kind: str, options: FiniteElementOptions,
 ) -> Row:  # fmt: skip
-    """Measure, and set it against the truth."""
+    """Measure the whole displacement, and compare it with the truth."""
     px = pair.grid.pixel_size
     mesh = mesh_specimen(specimen, 16.0 * px) if kind == "specimen" else None
     wall, cpu = time.perf_counter(), time.process_time()

@@ -1,12 +1,12 @@
-"""A wrong material law recognised as wrong, a right one not: p-values of the tests over seeds.
+"""Whether tests reject a wrong material law, and not a right one: p-values over seeds.
 
     scripts/env python benchmarks/wrong_law.py --seeds 20
 
-Data of an Ogden and of a two-term I1 material are identified with an Ogden material: a specimen of
-4 x 4 holes in one state before and one or more after buckling, 1 % noise in each image, 0.5 % of
-the larger force. The first seed is identified from afar; the others begin where it ended, by states
-that are linear about that. Elements are those of a run of ``modeharvest identify``: cubic ones, of
-degree 4 on a finer mesh for the last steps, and on one still finer for the data.
+Data of an Ogden and of a two-term I1 material are identified with an Ogden model: a specimen of 4 x
+4 holes in one state before and one or more after buckling, noise of 1 % in images, of 0.5 % of the
+larger force in forces. The first seed starts far off; the others start at its result, with states
+that are linear about it. Elements are those of ``modeharvest identify``: cubic, degree 4 on a finer
+mesh for last steps, and finer ones for the data. Table: docs/explanation/identification_laws.md.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ def main() -> None:
 def test(
     material: Material, names: list[str], size: float, degree: int, strains: tuple[float, ...]
 ) -> ParametricTest:
-    """A model with elements of a size [mm] and degree."""
+    """Model with elements of ``size`` [mm] and ``degree``."""
     experiment = Experiment(SPECIMEN, material=material, strains=strains, mesh_size=size)
     return ParametricTest.meshed(experiment, names, degree)
 
 
 def by_law(material: Material, how: argparse.Namespace) -> list[str]:
-    """Identify an Ogden material from data of this one; medians of p, and how many are small."""
+    """Identify an Ogden model from data of this law; medians of p, and how many are small."""
     seeds, strains, px = how.seeds, tuple(how.strains), how.pixel_size
     twin = test(material, ["tilt"], TWIN, 4, strains)
     states = twin.at(np.array([0.01]), False)

@@ -1,6 +1,6 @@
 """Buckled branches of lattices: energies, stability, amplitudes.
 
-The tables of docs/explanation/modes.md.
+Prints the table of docs/explanation/modes.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FACTORS = (1.05, 1.2, 1.5)
 def show(
     name: str, cell: UnitCell, loading: MacroLoading, combinations: Sequence[tuple[float, ...]]
 ) -> None:
-    """Print each branch's states, a line each; l = 1 mm."""
+    """Print a line for each state of each branch, in a lattice with unit cell size l = 1 mm."""
     primitive = PeriodicCell(cell, TwoTermI1())
     critical = first_critical(CellPath(primitive, loading))
     modes = real_modes(primitive, critical.state, critical.waves)
@@ -41,7 +41,7 @@ def show(
 
 
 def exponent(curve: np.ndarray) -> float:
-    """The power of e - e_c with which the amplitude begins to grow: 1/2 at a pitchfork."""
+    """Exponent of e - e_c in the initial growth of the amplitude [-]: 1/2 at a pitchfork."""
     excess = np.abs(curve[1:3, 1] - curve[0, 1])
     return float(np.diff(np.log(curve[1:3, 0]))[0] / np.diff(np.log(excess))[0])
 

@@ -1,6 +1,6 @@
 """Mode families of lattices: waves, parameters, energy captured.
 
-The table of docs/explanation/families.md.
+Prints the numbers in the table of docs/explanation/families.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from modeharvest.idic.spectra.mode_family import mode_family
 
 
 def show(name: str, cell: UnitCell, loading: MacroLoading, *, combined: bool = False) -> None:
-    """Print what the first mode, or the sum of all critical ones, is made of; l = 1 mm."""
+    """Print the family of the first critical mode, or of the sum of all of them; l = 1 mm."""
     body = PeriodicCell(cell, TwoTermI1())
     critical = first_critical(CellPath(body, loading))
     assert critical.state is not None, critical.outcome

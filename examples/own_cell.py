@@ -1,8 +1,8 @@
-"""A lattice of one's own, from a mesh in metres to its modes, by a case file.
+"""Modes of a lattice with the user's own unit cell, from a mesh in metres and a case file.
 
-gmsh makes the cell, as any other program might: an oval hole in a rectangle, opposite sides
-divided alike. The case names the file and its unit; all else is in mm. Afterwards the mode is read
-with h5py alone, at the nodes of the file: ``scripts/env python examples/own_cell.py``.
+gmsh makes the cell; any other mesher can be used. The cell is a rectangle with an oval hole, and
+opposite sides have matching nodes. The case has the file's name and unit; all else is in mm. The
+mode is read with h5py alone, at the file's nodes. Run: ``scripts/env python examples/own_cell.py``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ map_divisions = 0
 
 
 def make_cell(path: Path) -> None:
-    """A rectangle of 2 x 1.6 mm with an oval hole, meshed by gmsh in metres."""
+    """Write the mesh [m] of a rectangle of 2 x 1.6 mm with an oval hole, made by gmsh."""
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     width, height = 2e-3, 1.6e-3
@@ -52,7 +52,7 @@ def make_cell(path: Path) -> None:
     gmsh.model.occ.cut([(2, plate)], [(2, hole)])
     gmsh.model.occ.synchronize()
     gmsh.option.setNumber("Mesh.MeshSizeMax", 0.12e-3)
-    for axis, size in enumerate((width, height)):  # the right side like the left one, ...
+    for axis, size in enumerate((width, height)):  # right side as left, top as bottom
         sides: dict[bool, int] = {}
         for _, curve in gmsh.model.getEntities(1):
             box = gmsh.model.getBoundingBox(1, curve)
@@ -68,7 +68,7 @@ def make_cell(path: Path) -> None:
 
 
 def main(folder: Path) -> dict[str, Any]:
-    """Mesh, case and analysis in a folder; returns the content of ``summary.json``."""
+    """Write mesh and case in a folder, and run it; returns the content of ``summary.json``."""
     folder.mkdir(parents=True, exist_ok=True)
     make_cell(folder / "cell.msh")
     (folder / "case.toml").write_text(CASE, "utf-8")
@@ -76,7 +76,7 @@ def main(folder: Path) -> dict[str, Any]:
     print(summary["outcome"], *summary["notes"], sep="\n")
     with h5py.File(folder / "out" / "modes.h5") as file:
         tags, mode = file["origin"][:], file["shapes"][0]
-    for k in range(3):  # the first nodes are the file's, by their tags
+    for k in range(3):  # the first nodes are those of the file, with their tags
         print(f"node {tags[k]}: mode ({mode[k, 0]:.3f}, {mode[k, 1]:.3f})")
     return summary
 

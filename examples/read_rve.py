@@ -1,4 +1,4 @@
-"""Read an RVE file (docs/reference/rve.md) with h5py alone, and say what is in it.
+"""Read an RVE file (docs/reference/rve.md) with h5py alone, and print its content.
 
 python examples/read_rve.py out/homogenized/rve.h5
 """
@@ -9,7 +9,7 @@ import h5py
 
 
 def read(path):
-    """Arrays of the file by their names, and attributes of everything, those of the file at "/"."""
+    """Arrays of a file by name; attributes of arrays and groups by name, "/" for the file's."""
     arrays, attributes = {}, {}
 
     def keep(name, thing):

@@ -1,4 +1,4 @@
-"""Rebuild the mean stresses of an RVE file from its mesh, modes and law, with numpy alone.
+"""Recompute the mean stresses in an RVE file from its mesh, modes and law, with numpy alone.
 
 python examples/rve_stress.py out/homogenized/rve.h5
 """
@@ -10,7 +10,7 @@ from read_rve import read
 
 
 def displacement(rve, q, w):
-    """(n, 2) u = (F - I) X + sum (v_i + g_i . X) phi_i + w [mm] at generalised strains q."""
+    """(n, 2) u = (F - I) X + sum (v_i + g_i . X) phi_i + w [mm] for generalised strains q."""
     X, m = rve["nodes"], len(rve["modes"])
     amplitudes = q[4 : 4 + m] + X @ q[4 + m :].reshape(m, 2).T
     affine = X @ (q[:4].reshape(2, 2) - np.eye(2)).T
@@ -18,7 +18,7 @@ def displacement(rve, q, w):
 
 
 def stress(F, law):
-    """(..., 2, 2) dW/dF [MPa], by the principal stretches s."""
+    """(..., 2, 2) first Piola-Kirchhoff stress dW/dF [MPa], from the principal stretches s."""
     U, s, V = np.linalg.svd(F)
     J, I1 = np.prod(s, axis=-1)[..., None], np.sum(s**2, axis=-1)[..., None] + 1
     if law["kind"] == "Ogden":
@@ -31,8 +31,8 @@ def stress(F, law):
 
 
 def mean_stress(rve, law, u):
-    """(2, 2) P [MPa] by the three-point Gauss rule, over the area with holes."""
-    a, b, c = (1 + 3 * np.eye(3)) / 6  # barycentric coordinates of the points
+    """(2, 2) mean P [MPa]: three-point Gauss rule, divided by the area that includes holes."""
+    a, b, c = (1 + 3 * np.eye(3)) / 6  # barycentric coordinates of the three points
     none = np.zeros(3)
     by_b = [1 - 4 * a, 4 * b - 1, none, 4 * (a - b), 4 * c, -4 * c]
     by_c = [1 - 4 * a, none, 4 * c - 1, -4 * b, 4 * b, 4 * (a - c)]

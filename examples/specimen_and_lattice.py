@@ -1,4 +1,4 @@
-"""The pattern in the middle of a finite specimen, beside that of the infinite lattice."""
+"""Compare the pattern in the middle of a finite specimen with that of the infinite lattice."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PITCH, DIAMETER, SIZE, STRAIN = 1.9, 1.5, 0.2, 0.128
 
 
 def main() -> None:
-    """Compress 6 x 10 holes; give the lattice the mean deformation of the middle 2 x 2 cells."""
+    """Compress 6 x 10 holes; load the lattice with the mean F of the 2 x 2 cells in the middle."""
     material = TwoTermI1()
     solution = simulate(Experiment(material=material, strains=(STRAIN,), mesh_size=SIZE))
     u, tree = solution.at(STRAIN).displacement, cKDTree(solution.mesh.nodes)

@@ -7,7 +7,7 @@ IMAGING = mh.ImagingSpec(pixel_size=0.01)
 
 
 def main(experiment=EXPERIMENT, imaging=IMAGING, folder="out/example"):
-    """Return, for each strain, the rms per component [px] of w and of the best possible fit."""
+    """Return, by strain, the rms per component [px] of truth - IDIC and of truth - best fit."""
     solution = mh.simulate(experiment)
     print("critical strain", solution.info["critical"]["strain"])
 

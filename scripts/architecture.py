@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Draw the figure and the module tables of docs/architecture.md from the code.
+"""Make the figure and the module tables of docs/architecture.md from the code.
 
     scripts/architecture.py [--check]
 
-The tables are the first lines of docstrings: everything below the mark is replaced. The figure has
-the layers, their packages and how many modules these have. With --check nothing is written, and the
-exit code is 1 where page or figure aren't what the code says.
+The tables have the first lines of docstrings; they replace everything below the mark in the page.
+The figure shows the layers, their packages and the number of modules in each. With --check nothing
+is written, and the exit code is 1 if page or figure differ from the code.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ APPLICATION = PROJECT / "src/modeharvest"
 FOLDERS = ("fem", "imaging", "idic", "validation")
 FIGURE = PROJECT / "docs/images/architecture.svg"
 LAYERS = (("util",), *((name,) for name in FOLDERS), ("runs", "report"), ("cli",))
-"""Each may import what stands to its left."""
+"""Layers from left to right; each may import those to its left."""
 WIDTH, GAP, LINE, TOP = 122, 18, 17, 34
-"""Of a layer, between layers, of a line of text, of a heading [px]."""
+"""Width of a layer, gap between layers, height of a line of text and of a heading [px]."""
 
 
 def packages() -> Iterator[Path]:
-    """Every folder of modules, the four of the science first, each before what it holds."""
+    """Folders of all packages, those in ``FOLDERS`` first, each before its subpackages."""
     for name in FOLDERS:
         yield from sorted(path.parent for path in (PROJECT / name).rglob("__init__.py"))
     for path in sorted(path.parent for path in APPLICATION.rglob("__init__.py")):
@@ -37,13 +37,13 @@ def packages() -> Iterator[Path]:
 
 
 def first_line(module: Path) -> str:
-    """What the module is, by the first line of its docstring; empty where it has none."""
+    """First line of a module's docstring; empty if it has none."""
     text = ast.get_docstring(ast.parse(module.read_text(encoding="utf-8"))) or ""
     return text.partition("\n")[0]
 
 
 def tables() -> str:
-    """A heading and a table for every package."""
+    """Headings and tables of all packages, as Markdown."""
     parts = []
     for package in packages():
         name = package.relative_to(PROJECT).as_posix()
@@ -56,7 +56,7 @@ def tables() -> str:
 
 
 def counted(name: str) -> list[tuple[str, int]]:
-    """Packages within a layer's own, with how many modules each has; the layer itself first."""
+    """Packages of a layer and their numbers of modules; the layer's top package comes first."""
     root = (PROJECT if name in FOLDERS else APPLICATION) / name
     inner = sorted(path.parent for path in root.rglob("__init__.py"))
     return [
@@ -66,7 +66,7 @@ def counted(name: str) -> list[tuple[str, int]]:
 
 
 def box(name: str, x: int, y: int) -> tuple[list[str], int]:
-    """A layer's box at a place as SVG, and where it ends."""
+    """SVG elements of a layer's box at (x, y) [px], and y of its lower edge [px]."""
     rows = counted(name)
     height = TOP + LINE * (len(rows) - 1) + 10
     total = sum(count for _, count in rows)
@@ -83,7 +83,7 @@ def box(name: str, x: int, y: int) -> tuple[list[str], int]:
 
 
 def figure() -> str:
-    """The layers from left to right, as SVG that is legible on light and on dark pages."""
+    """SVG of the layers from left to right, legible on light and on dark pages."""
     parts, lowest = [], 0
     for k, names in enumerate(LAYERS):
         x, y = k * (WIDTH + GAP) + 1, 1
@@ -107,7 +107,7 @@ def figure() -> str:
 
 
 def main() -> int:
-    """Write page and figure, or compare them with the code."""
+    """Write page and figure, or with --check compare them with the code; the exit code."""
     prose = PAGE.read_text(encoding="utf-8").partition(MARK)[0]
     drawn = {PAGE: prose + MARK + tables(), FIGURE: figure()}
     if "--check" in sys.argv[1:]:

@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""Run every shipped case and study in a checkout, and compare what two checkouts computed.
+"""Run every shipped case and study in a checkout, and compare the results of two checkouts.
 
     scripts/compare_outputs.py make CHECKOUT OUT [--whole] [--only NAME ...]
     scripts/env python scripts/compare_outputs.py compare BEFORE AFTER [--tolerance 1e-12]
 
-``make`` runs the commands below in CHECKOUT (studies with --quick unless --whole is given), each
-in a folder of its own in OUT; finished commands are not repeated. ``compare`` walks both: every
-number of every JSON, CSV, HDF5, NPZ, TIFF and VTU file, by the names that
-``scripts/renamed_outputs.toml`` gives to what was called otherwise before. Pages, pictures,
-durations, software versions and digests are left out, and so are files named after a digest (tables
-repeat what they hold). Sentences for readers are listed where they differ, but are no difference.
-Exit code 1 where anything else differs by more than the tolerance (relative, absolute below 1).
+``make`` runs the commands below with CHECKOUT (studies with --quick unless --whole is given), each
+in a separate folder in OUT; finished commands are not repeated. ``compare`` compares all numbers
+and texts in the JSON, CSV, HDF5, NPZ and TIFF files of BEFORE, and the points and point data of VTU
+files; ``scripts/renamed_outputs.toml`` has the new names of renamed ones. Pages, pictures,
+durations, software versions, digests and files named by a digest (tables repeat their content) are
+left out. New values and changed sentences are listed, but don't count as differences. The exit code
+is 1 if anything else is missing or differs by more than the tolerance (relative; absolute below 1).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ COMMANDS = {
     "systematic": "study systematic {quick} --out {out}",
     "paper-real-twin": "run paper-real-twin --out {out}",
 }
-"""Every shipped case and study."""
+"""Commands of all shipped cases and studies, by the names of their folders in OUT."""
 
 RENAMED = Path(__file__).with_name("renamed_outputs.toml")
 NOT_COMPUTED = {"timings.json", "stages.json"}
@@ -49,12 +49,12 @@ READ = {".json", ".csv", ".npz", ".tif", ".tiff", ".h5", ".vtu"}
 PROSE = "a sentence"
 DIGEST = re.compile(r"[0-9a-f]{12,64}")
 LEAST_WORDS = 4
-"""A text of that many words is a sentence for readers."""
+"""A text of at least this many words is a sentence for readers."""
 SKIPPED = {"seconds", "versions", "source", "sha256", "digest", "key", "software", "files"}
 
 
 def make(checkout: Path, out: Path, whole: bool, only: list[str]) -> int:
-    """Run the commands in a checkout, a failed one without stopping; the number that failed."""
+    """Run the commands with a checkout; go on after failures, and return their number."""
     failed = 0
     for name, command in COMMANDS.items():
         done = out / f"{name}.done"
@@ -72,7 +72,7 @@ def make(checkout: Path, out: Path, whole: bool, only: list[str]) -> int:
 
 
 class Renamed:
-    """What files, keys, columns and values are called now that were called otherwise before."""
+    """New names of files, keys, columns and values that have been renamed; removed keys."""
 
     def __init__(self, table: Path) -> None:
         content = tomllib.loads(table.read_text()) if table.is_file() else {}
@@ -82,11 +82,11 @@ class Renamed:
         self.removed: dict[str, list[str]] = content.get("removed", {})
 
     def gone(self, path: Path) -> set[str]:
-        """Keys that a file of the earlier run had."""
+        """Keys of a file of the earlier run that have been removed since."""
         return {key for file, keys in self.removed.items() if path.match(file) for key in keys}
 
     def path(self, path: Path) -> Path:
-        """Where a file of the earlier run lies now."""
+        """Path of a file of the earlier run with its present name."""
         return next(
             (path.with_name(new) for old, new in self.files.items() if path.match(old)), path
         )
@@ -95,7 +95,7 @@ class Renamed:
 def flat(
     thing: object, renamed: Renamed, skipped: set[str], at: str = ""
 ) -> Iterator[tuple[str, object]]:
-    """Every number and text of a JSON file, with the path of keys that leads to it."""
+    """Path of keys, and value, of every number and text of a JSON file."""
     if isinstance(thing, dict):
         for key, value in thing.items():
             if key not in skipped:
@@ -108,7 +108,7 @@ def flat(
 
 
 def contents(path: Path, renamed: Renamed) -> Iterator[tuple[str, object]]:
-    """Every number, text, array and attribute of a file, by name."""
+    """Name and value of every number, text, array and attribute of a file."""
     import h5py
     import meshio
     import numpy as np
@@ -151,7 +151,7 @@ def contents(path: Path, renamed: Renamed) -> Iterator[tuple[str, object]]:
 
 
 def difference(before: object, now: object, tolerance: float) -> str:
-    """How two values differ; nothing where they agree."""
+    """Text of the difference of two values; empty if they agree."""
     import numpy as np
 
     one, other = np.asarray(before), np.asarray(now)
@@ -172,12 +172,12 @@ def difference(before: object, now: object, tolerance: float) -> str:
 
 
 def alternatives(key: str) -> list[str]:
-    """A path of keys; several, where one of them is now called this|or that."""
+    """The paths that a path of keys stands for, where parts may be alternatives "a|b"."""
     return ["/".join(parts) for parts in product(*(part.split("|") for part in key.split("/")))]
 
 
 def compare(before: Path, after: Path, tolerance: float) -> int:
-    """Print every difference; the number of them."""
+    """Print all differences; return their number, without new values and changed sentences."""
     renamed, as_is, differences, values = Renamed(RENAMED), Renamed(Path()), 0, 0
     files = [
         path
@@ -208,7 +208,7 @@ def compare(before: Path, after: Path, tolerance: float) -> int:
 
 
 def main() -> int:
-    """Read the arguments and do what they ask."""
+    """Run ``make`` or ``compare`` as given by the arguments; the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

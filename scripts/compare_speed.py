@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""What commands take in two checkouts, in turn: processor seconds, and peak memory.
+"""Compare processor time and peak memory of commands between two checkouts.
 
     scripts/compare_speed.py BEFORE AFTER [--rounds 5] [--only NAME ...]
 
-Every command runs in both by their own ``scripts/env``, one after the other, B A B A ..., after a
-round that compiles and isn't counted, on one thread. Seconds are those of the process and its
-children on all processors; memory is that of the largest process. The ratio is the median of those
-of a round, beside its least and largest: what differs by less than these is noise. Cases are made
-once, in a folder that is removed: commands work on the shipped solution of paper-virtual, T6 or cut
-into T3, with pixels that show points or average (``fill_factor``, ``psf_px``).
+Every command runs with ``scripts/env`` of both checkouts in turn, B A B A ..., on one thread, after
+a first run for compilation that isn't counted. Time [s] is processor time of the process and its
+children; memory [MiB] is that of the largest process. The table has the median of the rounds'
+ratios with their range: a difference within this range is noise. The cases are made once, in a
+temporary folder. Images are made from the shipped solution of paper-virtual, with T6 elements or
+divided into T3, and pixels that sample points or average (``fill_factor``, ``psf_px``).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ pixel_size = {pixel}
 order = 5
 gradient = "deformed"
 """
-"""What both versions may choose differently is given."""
+"""Case file, with values of the options whose defaults may differ between the versions."""
 AVERAGING = "[imaging.sensor]\nfill_factor = 1.0\npsf_px = 0.5"
 
 CUT = """
@@ -42,18 +42,18 @@ with h5py.File(sys.argv[1], "r+") as f:
     f["cells"] = np.vstack([cells[:, c] for c in ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))])
     f.attrs["element"] = "T3"
 """
-"""A file of T6 with straight or curved edges becomes one of T3, four for each."""
+"""Program that divides each T6 element of a file, straight or curved, into four T3 elements."""
 
 
 @dataclass(frozen=True)
 class Checkout:
-    """A version of the program, and a folder for what it leaves."""
+    """A version of the program, and the folder of its results."""
 
     path: Path
     folder: Path
 
     def run(self, command: str) -> tuple[float, float]:
-        """Processor seconds of a command, and peak memory [MiB]; ``{cases}`` has the cases."""
+        """Processor time [s] and peak memory [MiB] of a command, with the folders filled in."""
         words = command.format(out=self.folder, cases=self.folder.parent).split()
         environment = {**os.environ, "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
         process = subprocess.Popen(
@@ -72,19 +72,19 @@ class Checkout:
 
 @dataclass(frozen=True)
 class Contest:
-    """A command that both checkouts run: what goes before it, and what it must find gone."""
+    """A command to be timed, commands to run ``first``, and results ``removed`` before each run."""
 
     command: str
     first: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
 
     def prepare(self, checkout: Checkout) -> None:
-        """Run what goes before."""
+        """Run the commands that come first."""
         for command in self.first:
             checkout.run(command)
 
     def once(self, checkout: Checkout) -> tuple[float, float]:
-        """Seconds and memory of the command."""
+        """Processor time [s] and peak memory [MiB] of one run of the command."""
         for name in self.removed:
             path = checkout.folder / name
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
@@ -95,7 +95,7 @@ MAIN = "python -m modeharvest"
 
 
 def image(case: str, element: str) -> Contest:
-    """The images of a case, made anew."""
+    """Making all images of a case, from the solution with ``element``."""
     solution = f"--solution {{cases}}/{element}.h5"
     out = f"{case}-{element}"
     command = f"{MAIN} image {{cases}}/{case}.toml {solution} --out {{out}}/{out}"
@@ -129,7 +129,7 @@ CONTESTS = {
 
 
 def make_cases(folder: Path, after: Checkout) -> None:
-    """Cases and solutions that both checkouts read."""
+    """Write the cases and solutions that both checkouts read."""
     shipped = after.path / "src" / "modeharvest" / "cases"
     for name, sensor in (("points", ""), ("averaging", AVERAGING)):
         (folder / f"{name}.toml").write_text(CASE.format(pixel=0.01, sensor=sensor))
@@ -143,7 +143,7 @@ def make_cases(folder: Path, after: Checkout) -> None:
 
 
 def rows(names: list[str], both: tuple[Checkout, Checkout], rounds: int) -> Iterator[str]:
-    """The rows of the table."""
+    """The rows of the table, one for each command, as Markdown."""
     for name in names:
         contest = CONTESTS[name]
         for checkout in both:
@@ -161,7 +161,7 @@ def rows(names: list[str], both: tuple[Checkout, Checkout], rounds: int) -> Iter
 
 
 def main() -> None:
-    """Print the table."""
+    """Run the commands and print the table."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("before", type=Path, help="a checkout")
     parser.add_argument("after", type=Path, help="another one")

@@ -17,6 +17,7 @@ from modeharvest.idic.finite_element.files import Given, write_result
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.photograph.finished import FinishedRun
 from modeharvest.imaging.photographs.files import write_image
+from modeharvest.report.figures.on_photographs import write_pdf
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import write_json
 
@@ -125,6 +126,13 @@ def test_fields_are_printed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert called(monkeypatch, "animate", run, "--as", "pdf", *wanted) == 0
     content = (run / "fields.pdf").read_bytes()
     assert content.count(b"/Type /Page ") + content.count(b"/Type /Page\n") == 1 + 2 * 2
+
+
+@pytest.mark.parametrize(("rows", "pages"), [(0, 1), (60, 1), (61, 2)])
+def test_a_long_table_goes_on_on_the_next_page(rows: int, pages: int, tmp_path: Path) -> None:
+    write_pdf(tmp_path / "table.pdf", "Numbers", [["unit"], *[["px"]] * rows], [])
+    content = (tmp_path / "table.pdf").read_bytes()
+    assert content.count(b"/Type /Page ") + content.count(b"/Type /Page\n") == pages
 
 
 def test_what_cannot_be_done_is_one_line(

@@ -17,7 +17,7 @@ from modeharvest.idic.photograph.holes import (
     find_holes,
     lattice_of,
 )
-from modeharvest.idic.photograph.matching import possible_motions
+from modeharvest.idic.photograph.matching.holes import possible_motions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.errors import InputError
 

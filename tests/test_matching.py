@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.idic.photograph.matching import (
+from modeharvest.idic.photograph.matching.blocks import (
     BlockMatch,
     Expected,
-    HoleMotion,
     _correlation,
     match_blocks,
     require_same_surface,
 )
+from modeharvest.idic.photograph.matching.holes import HoleMotion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec

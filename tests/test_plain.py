@@ -18,20 +18,17 @@ from summary_schemas import faults
 from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import stress_and_tangent
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.finite_element.contours import (
+from modeharvest.idic.finite_element.contours.measure import (
     ELASTOMER,
     STEPS_PX3,
     displacement_from_contours,
-    straight_sides,
 )
+from modeharvest.idic.finite_element.contours.penalised_body import straight_sides
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.photograph.plain import (
-    away_from_cuts,
-    displacement_of_plain,
-    matched_contours,
-    plain_surface,
-)
+from modeharvest.idic.photograph.plain.matching import matched_contours
+from modeharvest.idic.photograph.plain.measure import displacement_of_plain
+from modeharvest.idic.photograph.plain.surface import away_from_cuts, plain_surface
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images

@@ -14,7 +14,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.photograph.plain import away_from_cuts
+from modeharvest.idic.photograph.plain.surface import away_from_cuts
 from modeharvest.idic.photograph.speckled_edges import (
     body_for_edges,
     edges_of_speckled,

@@ -74,18 +74,23 @@ def test_quadratic_field_from_rest() -> None:
     assert np.sqrt(np.mean((F.reshape(-1, 4) - expected) ** 2)) < 2e-3
 
 
-@pytest.mark.parametrize(("lowest", "found"), [(25.0, 25.0), (13.0, 13.0), (5.0, 10.0)])
-def test_the_cut_off_of_least_risk_is_found_down_to_ten_pixels(
-    lowest: float, found: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("first", [10.0, 18.0, 150.0, 400.0])
+@pytest.mark.parametrize(
+    ("lowest", "found"),
+    [(25.0, 25.0), (13.0, 13.0), (11.0, 11.0), (5.0, 10.0), (390.0, 390.0), (900.0, 400.0)],
+)
+def test_the_cut_off_of_least_risk_is_found_between_ten_and_four_hundred_pixels(
+    lowest: float, found: float, first: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside the limit trials are unequally spaced; a parabola's vertex is found all the same."""
+    """Trials are unequally spaced beside a bound, which itself may have the lowest risk of them."""
 
     def risk(_at: object, px: float, _size: float, _excess: float) -> Risk:
         return Risk(px, 3.0 + np.log(px / lowest) ** 2, 1.0, 1.0)
 
     monkeypatch.setattr(cutoff, "risk", risk)
-    tried = least_risk(None, 18.0, 1.0, 1.0)  # type: ignore[arg-type]
+    tried = least_risk(None, first, 1.0, 1.0)  # type: ignore[arg-type]
     assert min(one.cutoff_px for one in tried) >= 10.0
+    assert max(one.cutoff_px for one in tried) <= 400.0
     assert best_of(tried) == pytest.approx(found)
 
 

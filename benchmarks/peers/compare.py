@@ -1,10 +1,10 @@
-"""modeharvest beside its peers: one command, one run, same images, same machine.
+"""Compare modeharvest with other programs: one run, same images, same machine.
 
 Run: benchmarks/peers/run [--quick] [--again] [ROW ...]
 
-Every row is measured in a process of its own and kept at once, so that an interrupted run goes
-on where it stopped; a change of the code, of the peers or of the machine begins a new one. Full
-runs write the tables of docs/explanation/benchmarks*.md, quick ones show them only.
+Every row is measured in a new process and stored at once, so that an interrupted run continues
+where it stopped; a change of the code, of the packages or of the machine starts a new one. Full
+runs write the tables of docs/explanation/benchmarks*.md, quick ones only print them.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ PAGES = {
     PROJECT / "docs/explanation/benchmarks.md": ("run", "geometry", "intensity"),
     PROJECT / "docs/explanation/benchmarks_correlation.md": ("correlation",),
 }
-"""And the tables that each has."""
+"""Pages, and the tables on each."""
 SECTIONS: dict[str, ModuleType] = {
     "geometry": geometry, "intensity": intensity, "correlation": correlation,
 }  # fmt: skip
 ROW_TIMEOUT_S = 1800.0
-"""Far more than any row takes, even on a busy machine: it ends a process that hangs."""
+"""Time limit, far longer than any row takes on a busy machine; for processes that hang."""
 
 
 def main() -> int:
@@ -90,7 +90,7 @@ def _chosen(beginnings: list[str], names: list[str]) -> list[str]:
 
 
 def _measure(section: str, options: dict[str, Any]) -> dict[str, Any]:
-    """Measure one row in a process of its own, which gives its memory back."""
+    """Measure one row in a new process, so that its memory is freed."""
     command = [sys.executable, __file__, "--measure", json.dumps([section, options])]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=ROW_TIMEOUT_S)

@@ -1,7 +1,7 @@
-"""IDIC beside pyxel-dic: same images, same pixels, same start, the same step to stop at.
+"""IDIC compared with pyxel-dic: same images, pixels, initial guess and step at which to stop.
 
-pyxel's basis is linear, so it is given the mode's parameters, and so is modeharvest in the
-rows that compare like with like; in its first row it finds them, which is its usual task.
+pyxel's basis is linear, so the mode's parameters are given to it, and to modeharvest in rows "mode
+given". In rows "mode free" modeharvest finds them, which is its usual task.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ QUANTISATION = 1.0 / np.sqrt(12.0)
 
 
 def rows(quick: bool) -> dict[str, dict[str, Any]]:
-    """Names of the rows and what :func:`measure` needs to know for each."""
+    """Names of the rows, and the options of :func:`measure` for each."""
     inside = {"kind": "inside", "shape": (520, 416) if quick else (1040, 832), "seed": 1}
     of_paper = {"kind": "paper", "shape": None if quick else (2207, 2751),
                 "pixel_size": 0.03 if quick else 0.01}  # fmt: skip
@@ -55,7 +55,7 @@ def rows(quick: bool) -> dict[str, dict[str, Any]]:
 
 
 def measure(options: dict[str, Any]) -> dict[str, Any]:
-    """One row, or a block of them."""
+    """Measure one row, or a block of rows."""
     use_threads(options["threads"])
     if "seeds" in options:
         return _patterns(options)
@@ -94,16 +94,16 @@ class _Ways:
         self.seconds: dict[str, list[float]] = {}
 
     def _best(self, ansatz: Ansatz, start: FloatArray) -> FloatArray:
-        """Fit an ansatz to the truth as well as it can."""
+        """Displacement of the best fit of an ansatz to the truth [mm]."""
         pair = self.pair
         return fit_displacement(pair.truth, pair.grid, ansatz, start, pair.mask).displacement()
 
     def free(self) -> Result:
-        """Ours, all 77 unknowns."""
+        """Correlate with modeharvest, all 77 unknowns."""
         return self._ours(self.pair.ansatz, self.pair.start)
 
     def mode_given(self) -> Result:
-        """Ours, with the unknowns that pyxel has."""
+        """Correlate with modeharvest, with the unknowns that pyxel has."""
         return self._ours(*self.pair.fixed())
 
     def _ours(self, ansatz: Ansatz, start: FloatArray) -> Result:
@@ -111,7 +111,7 @@ class _Ways:
         return correlate(self.pair.images, ansatz, guess=start, options=options)
 
     def pyxel(self, way: str) -> Callable[[], pyxel_side.Found]:
-        """pyxel's, in one of three ways."""
+        """A correlation with pyxel, in one of three ways."""
 
         def run() -> pyxel_side.Found:
             found = pyxel_side.correlate(self.pair, way, self.pixels)
@@ -121,7 +121,7 @@ class _Ways:
         return run
 
     def assessed(self, found: Any, best: FloatArray) -> dict[str, Any]:
-        """What to say of a result."""
+        """Numbers of a result for the table."""
         if isinstance(found, Result):
             displacement = found.displacement()
             assessed: dict[str, Any] = {
@@ -145,7 +145,7 @@ class _Ways:
 
 
 def _patterns(options: dict[str, Any]) -> dict[str, Any]:
-    """Errors over several speckle patterns, and what quantisation alone predicts."""
+    """Errors over several speckle patterns, and those that quantisation alone predicts."""
     found: dict[str, list[dict[str, Any]]] = {FREE: [], GIVEN: [], WAYS["dense"]: []}
     for seed in range(options["seeds"]):
         pair = inside_the_ansatz(options["shape"], 100 + seed)
@@ -231,7 +231,7 @@ def _pattern_lines(row: dict[str, Any] | None) -> list[str]:
         "|---|---|---|---|---|",
     ]
     for name, one in row["found"].items():
-        # Whoever has the same unknowns has the same bound.
+        # Programs with the same unknowns have the same bound.
         bound = one["predicted_px"] or row["found"][GIVEN]["predicted_px"]
         if one["error_px"] is None:
             lines.append(f"| {name} | 0 | – | – | – |")

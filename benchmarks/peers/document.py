@@ -10,7 +10,7 @@ END = "<!-- end -->"
 
 
 def write(page: Path, tables: dict[str, list[str]]) -> None:
-    """Replace what stands between ``<!-- peers: name -->`` and ``END`` for each table."""
+    """Replace the text between ``<!-- peers: name -->`` and ``END`` for each table."""
     text = page.read_text()
     for name, lines in tables.items():
         begin = f"<!-- peers: {name} -->"

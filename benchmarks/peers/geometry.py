@@ -1,6 +1,6 @@
-"""The inverse mapping beside riley-raster's nodal shader, pixel for pixel.
+"""The inverse mapping compared with riley-raster's nodal shader, pixel by pixel.
 
-Both are asked where in the undeformed mesh each pixel of the deformed one comes from.
+Both find the point of the undeformed mesh that each pixel of the deformed one shows.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from modeharvest.imaging.mapping.isoparametric import locate
 
 
 def rows(quick: bool) -> dict[str, dict[str, Any]]:
-    """Names of the rows and what :func:`measure` needs to know for each."""
+    """Names of the rows, and the options of :func:`measure` for each."""
     size = {"specimen": 700, "bulged": 300, "laps": 3} if quick else {
         "specimen": 2751, "bulged": 1000, "laps": 7}  # fmt: skip
     found: dict[str, dict[str, Any]] = {}
@@ -34,7 +34,7 @@ def rows(quick: bool) -> dict[str, dict[str, Any]]:
 
 
 def measure(options: dict[str, Any]) -> dict[str, Any]:
-    """One row of the table."""
+    """Measure one row of the table."""
     use_threads(options["threads"])
     view = _view(options)
     nodes, mesh = view.mesh.nodes, view.mesh
@@ -74,7 +74,7 @@ def _view(options: dict[str, Any]) -> MeshView:
 
 
 def compare(view: MeshView, mask: Any, point: Any, theirs: Any) -> dict[str, Any]:
-    """Where both see material, how far apart are the points; and who sees more."""
+    """Distance of the points where both see material, and pixels that only one sees."""
     covered = theirs[0] != riley_side.BACKGROUND
     both = mask & covered
     apart = np.hypot(theirs[0] - point[0], theirs[1] - point[1])[both] / view.grid.pixel_size

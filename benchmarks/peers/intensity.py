@@ -1,7 +1,7 @@
-"""Images of the deformed specimen beside riley-raster's textures, and both beside the pattern.
+"""Images by modeharvest and by riley-raster's textures, compared with the exact pattern.
 
-The pattern is a trigonometric polynomial, so its grey level at a point can be summed term by
-term. That is done at some random pixels of the material; no code under test takes part in it.
+The pattern is a trigonometric polynomial, so its grey level at a point can be summed term by term.
+That is done at some random pixels of the material, without any of the compared code.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 POINTS = 1000
 GREY_LEVELS = 255.0
 OURS = "modeharvest"
-# Name, texels a pixel, riley's sampler, how grey levels are stored.
+# Name, texels per pixel, riley's sampler, how grey levels are stored.
 TEXTURES: tuple[tuple[str, int, str, str], ...] = (
     ("Catmull-Rom, 1×", 1, "cubic_catmull_rom", "float"),
     ("Catmull-Rom, 2×", 2, "cubic_catmull_rom", "float"),
@@ -34,7 +34,7 @@ TEXTURES: tuple[tuple[str, int, str, str], ...] = (
 
 
 def rows(quick: bool) -> dict[str, dict[str, Any]]:
-    """Names of the rows and what :func:`measure` needs to know for each."""
+    """Names of the rows, and the options of :func:`measure` for each."""
     size, laps = (700, 2) if quick else (2751, 5)
     return {
         f"intensity-{threads}": {"rows": size, "laps": laps, "threads": threads}
@@ -43,7 +43,7 @@ def rows(quick: bool) -> dict[str, dict[str, Any]]:
 
 
 def measure(options: dict[str, Any]) -> dict[str, Any]:
-    """All contestants on one image."""
+    """Measure all programs on one image."""
     use_threads(options["threads"])
     view = specimen(options["rows"])
     speckle = Speckle(SpeckleSpec(), view.grid.shape)
@@ -71,7 +71,7 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def exact(view: MeshView, speckle: Speckle) -> FloatArray:
-    """Our image: the inverse mapping, and the pattern itself at the mapped points [grey levels]."""
+    """modeharvest's image: inverse mapping, and the pattern at the mapped points [grey levels]."""
     mesh, grid = view.mesh, view.grid
     state = ImagedState(mesh, view.deformed - mesh.nodes, grid, speckle, 0.0)
     grey = state.average(np.zeros((1, 2)), np.ones(1), np.ones(grid.shape, np.bool_))
@@ -97,13 +97,13 @@ def as_stored(texture: FloatArray, storage: str) -> NDArray[np.generic]:
 
 
 def in_grey_levels(name: str) -> float:
-    """What one unit of this texture is."""
+    """Grey levels of one unit of a texture."""
     storage: dict[str, str] = {t[0]: t[3] for t in TEXTURES}
     return 1.0 if storage[name] == "8-bit" else GREY_LEVELS
 
 
 def some_truth(view: MeshView, speckle: Speckle) -> tuple[tuple[Any, ...], FloatArray]:
-    """(rows, cols) of some pixels of the material, and their grey levels, term by term."""
+    """Rows and columns of some pixels of the material, and their grey levels, term by term."""
     mesh, grid = view.mesh, view.grid
     located = locate(view.deformed, mesh.cells, mesh.element, grid)
     inside = np.argwhere(located.mask)

@@ -1,4 +1,4 @@
-"""Threads, and the time that contestants take in turn."""
+"""Number of threads, and times of calls that run alternately."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Work = Callable[[], Any]
 
 
 def use_threads(count: int) -> None:
-    """Let kernels, BLAS and OpenCV, ours and the peers', use so many threads from now on."""
+    """Set the number of threads of kernels, BLAS and OpenCV, in all programs."""
     numba.set_num_threads(count)
     threadpool_limits(count)
     cv2.setNumThreads(count)
@@ -24,7 +24,7 @@ def use_threads(count: int) -> None:
 
 @dataclass(frozen=True)
 class Laps:
-    """What some work gave, and how long it took.
+    """Result of a call, and how long it took.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Laps:
 def in_turn(
     contestants: dict[str, Work], laps: int, warm_up: Collection[str] | None = None
 ) -> dict[str, Laps]:
-    """Run all in turn, ``laps`` times, so that a busy machine hits all alike.
+    """Run all alternately, ``laps`` times, so that other load affects all alike.
 
     Before that, those named in ``warm_up`` (all by default) run once, to compile.
     """

@@ -1,4 +1,4 @@
-"""Meshes to look at: the paper's specimen after buckling, and elements as bad as they are valid."""
+"""Meshes to image: the paper's specimen after buckling, and elements distorted but valid."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _QUAD = ((0, 0), (2, 0), (2, 2), (0, 2), (1, 0), (2, 1), (1, 2), (0, 1), (1, 1))
 
 @dataclass(frozen=True, eq=False)
 class MeshView:
-    """A mesh in two states, and the pixels that show the second.
+    """A mesh in two states, and the pixels of an image of the second.
 
     Parameters
     ----------
     name
-        For tables.
+        Name in tables.
     mesh
         The undeformed mesh.
     deformed
@@ -42,7 +42,7 @@ class MeshView:
 
 
 def specimen(rows: int) -> MeshView:
-    """Show the shipped solution after buckling in the paper's format, 2751 x 2207 px, upright."""
+    """The shipped solution after buckling in the paper's format (2751 x 2207 px, upright)."""
     path = shipped_solution("paper-virtual")
     assert path is not None, "the case ships its solution"
     solution = Solution.read(path)
@@ -55,8 +55,8 @@ def specimen(rows: int) -> MeshView:
 def bulged(element: str, rows: int, count: int = 20, seed: int = 0) -> MeshView:
     """Fill an image with ``count`` x ``count`` quadrilaterals, skewed and with bulged edges.
 
-    Corners are moved by up to 0.16 of an edge each way, nodes on edges and in the middle by up
-    to 0.07 from between them; triangles are halves of the quadrilaterals.
+    Corners are moved by up to 0.16 of an edge along x and y, other nodes by up to 0.07 from the
+    middle between corners; triangles are halves of the quadrilaterals.
     """
     lattice = _lattice(count)
     rng = np.random.default_rng(seed)
@@ -77,8 +77,8 @@ def bulged(element: str, rows: int, count: int = 20, seed: int = 0) -> MeshView:
 def aligned(element: str, rows: int) -> MeshView:
     """Fill an image with squares, or halves of them, whose edges run through pixel centres.
 
-    All positions are whole eighths, so that nothing is rounded: every pixel on an edge is on it
-    exactly, and nothing but a rule decides whose it is.
+    All positions are multiples of 1/8, so that nothing is rounded: pixels on an edge are exactly on
+    it, and only a rule decides to which element they belong.
     """
     count = (rows - 40) // 16
     lattice = _lattice(count)
@@ -89,7 +89,7 @@ def aligned(element: str, rows: int) -> MeshView:
 def _view(
     name: str, element: str, lattice: FloatArray, deformed: FloatArray, grid: PixelGrid
 ) -> MeshView:
-    """Pick the nodes that this element has."""
+    """View of a mesh with the nodes of this type of element."""
     cells = _cells(element, len(lattice) // 2)
     used, cells = np.unique(cells, return_inverse=True)
     mesh = Mesh(lattice.reshape(-1, 2)[used], cells.reshape(-1, _nodes(element)), element)

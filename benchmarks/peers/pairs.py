@@ -1,6 +1,6 @@
-"""Pairs of images to correlate, with what there is to find.
+"""Pairs of images to correlate, with their true displacement.
 
-Mode parameters are held where the peer has to be given them: its basis is linear.
+The mode's parameters can be fixed, because pyxel's basis is linear and they are given to it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ EDGE_PX = 40
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
-    """Two images, what is known of them, and where to start.
+    """Two images with masks, ansatz, initial guess and truth.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class ImagePair:
     mask, deformed_mask
         (rows, cols) where there is material; None for everywhere in the deformed image.
     ansatz, start
-        What to look for, with free mode parameters, and (size,) the standard start.
+        Ansatz with free mode parameters, and (size,) the standard start.
     truth
         (rows, cols, 2) displacement at the reference's pixels [mm].
     mesh
@@ -63,14 +63,14 @@ class ImagePair:
     mesh: Mesh | None = None
 
     def error_px(self, displacement: FloatArray, other: FloatArray | None = None) -> float:
-        """Rms length of what separates a displacement from the truth, or from another [px]."""
+        """Rms length of a displacement's difference from the truth, or from another [px]."""
         apart = (displacement - (self.truth if other is None else other))[self.mask]
         return float(np.sqrt((apart**2).sum(axis=-1).mean()) / self.grid.pixel_size)
 
     def pixels(self, displacement: FloatArray, edge_px: int) -> BoolArray:
-        """(rows, cols) pixels off the edges by so much, in both images if moved like this [mm].
+        """Pixels (rows, cols) off edges by ``edge_px`` in both images, for a displacement [mm].
 
-        It is the set that modeharvest settles on, made beforehand for a code without masks.
+        modeharvest ends with the same set; it is made beforehand for a program without masks.
         """
         inside = eroded(self.mask, edge_px).copy()
         if self.deformed_mask is None:
@@ -84,7 +84,7 @@ class ImagePair:
 
     @property
     def images(self) -> CheckedPair:
-        """The images as ours takes them."""
+        """The pair in modeharvest's own class."""
         return CheckedPair(self.reference, self.deformed, self.grid, self.mask, self.deformed_mask)
 
     def fixed(self) -> tuple[Ansatz, FloatArray]:
@@ -97,8 +97,8 @@ class ImagePair:
 def inside_the_ansatz(shape: tuple[int, int], seed: int) -> ImagePair:
     """8-bit images of a displacement that the ansatz can describe exactly, pattern everywhere.
 
-    The start has the applied strain of 5 %, as in the paper, and the mode at 1 mm; the truth
-    has 2.5 mm of it (10 px), unevenly, and v0 is disturbed by about 1 px an unknown.
+    The start has the applied strain of 5 %, as in the paper, and a mode of amplitude 1 mm; the true
+    amplitude is about 2.5 mm (10 px), and v0 is changed by about 1 px per unknown.
     """
     grid = PixelGrid.centred(*shape, PIXEL)
     box = Box(grid.x[0], grid.x[-1], grid.y[-1], grid.y[0])
@@ -127,7 +127,7 @@ def _came_from(ansatz: Ansatz, a: FloatArray, grid: PixelGrid) -> FloatArray:
     low, high = at[-1, 0], at[0, -1]
     point = at
     for _ in range(200):
-        # Polynomials run away outside the box; what lies there isn't correlated.
+        # Polynomials grow fast outside the box; points there aren't correlated.
         moved = at - ansatz.displacement_at(a, np.clip(point, low, high))
         change = abs(moved - point).max()
         point = moved
@@ -137,7 +137,7 @@ def _came_from(ansatz: Ansatz, a: FloatArray, grid: PixelGrid) -> FloatArray:
 
 
 def paper(shape: tuple[int, int] | None, pixel_size: float) -> ImagePair:
-    """Make the paper's virtual experiment after buckling, float images, as its case says."""
+    """Make float images of the paper's virtual experiment after buckling, as in its case."""
     case, path = Case(), shipped_solution("paper-virtual")
     assert path is not None, "the case ships its solution"
     solution = Solution.read(path)

@@ -1,9 +1,9 @@
 """pyxel-dic with the ansatz's basis: the linear part u = v0 + v1 phi1, phi1 given.
 
 pyxel solves for the degrees of freedom of a mesh, whose ``phix`` and ``phiy`` map them to the
-displacement of integration points. Three ways to give it the ansatz, all with its own engine
-(``Correlate``: modified Gauss-Newton, bicubic splines, its normalisation of brightness, direct
-solver) and its own pyramid (``MultiscaleInit``'s scales 3, 2, 1, then full resolution):
+displacement of integration points. The ansatz is given to it in three ways, with pyxel's engine
+(``Correlate``: modified Gauss-Newton, bicubic splines, normalisation of brightness, direct solver)
+and pyramid (``MultiscaleInit``'s scales 3, 2, 1, then full resolution):
 
 * ``dense``: a column of phix and phiy for each unknown, a row for each pixel, as plain arrays;
 * ``sparse``: the same as sparse matrices, the format that pyxel's own integration makes;
@@ -33,13 +33,13 @@ MAX_ITERATIONS = 100
 TOLERANCE_PX, COARSE_TOLERANCE_PX = 1e-4, 1e-2
 """Rms step at which to stop, the second in binned px: the defaults of modeharvest."""
 ELEMENT_PX = 10
-"""Edge of the Q9 where there is no mesh of a specimen [px]."""
+"""Edge of the Q9 elements of images without a specimen's mesh [px]."""
 _CHUNK = 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What pyxel found.
+    """Result of pyxel.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Found:
 
 
 class CountingEngine(pyxel.dic.DICEngine):  # type: ignore[misc]
-    """pyxel's engine, and how often it was asked for a right-hand side."""
+    """pyxel's engine, which counts its right-hand sides."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class CountingEngine(pyxel.dic.DICEngine):  # type: ignore[misc]
 
 
 def correlate(pair: ImagePair, way: str, pixels: BoolArray) -> Found:
-    """Correlate a pair ``way``: "dense", "sparse" or "elements"; ``pixels`` count."""
+    """Correlate a pair at ``pixels``; ``way`` is "dense", "sparse" or "elements"."""
     n = pair.ansatz.phi_offset(0)
     scaling = _scaling(pair, pixels, diagonal=way == "sparse")
     unknowns = np.asarray(np.linalg.solve(scaling, pair.start[:n]))
@@ -153,8 +153,8 @@ def _pixel_mesh(
     mesh.phix, mesh.phiy = (np.ascontiguousarray(columns[:, c]) for c in (0, 1))
     if way == "sparse":
         mesh.phix, mesh.phiy = (scipy.sparse.csr_matrix(p) for p in (mesh.phix, mesh.phiy))
-    # pyxel's camera divides by the factor, and leaves the half pixel between the centres of a
-    # block and of its first pixel to us: nothing is lost by it, both images have it.
+    # pyxel's camera divides by the factor, and ignores the half pixel between the centres of a
+    # block and of its first pixel. This has no effect, because it is the same in both images.
     mesh.pgx, mesh.pgy = factor * col.astype(np.float64), -factor * row.astype(np.float64)
     mesh.npg, mesh.wdetJ = len(row), np.ones(len(row))
     return mesh
@@ -187,7 +187,7 @@ def _over_elements(
 
 
 def _keep(mesh: pyxel.Mesh, pixels: BoolArray) -> None:
-    """Leave out the integration points whose pixels don't count."""
+    """Remove the integration points at pixels that are not used."""
     row, col = np.rint(-mesh.pgy).astype(int), np.rint(mesh.pgx).astype(int)
     keep = pixels[row, col]
     mesh.phix, mesh.phiy = mesh.phix[keep], mesh.phiy[keep]

@@ -1,4 +1,4 @@
-"""What was measured, on which machine, with which code: a JSON file that survives interruption."""
+"""Record of measured rows, machine and code: a JSON file, from which a run continues."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CODE = ("fem/field.py", "imaging/**/*.py", "idic/**/*.py", "benchmarks/peers/*.p
 
 
 def stamp(project: Path) -> dict[str, Any]:
-    """What all rows of a run must have in common."""
+    """Code, packages and machine, which all rows of a run must have in common."""
     code = hashlib.sha256()
     for pattern in CODE:
         for path in sorted(project.glob(pattern)):
@@ -34,7 +34,7 @@ def stamp(project: Path) -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """The processor's name, where the system tells."""
+    """The processor's name, if the system gives it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -50,11 +50,11 @@ class Record:
     Parameters
     ----------
     path
-        Of the file.
+        Path of the file.
     run
         The run's stamp.
     rows
-        What each row measured, with the time at which it was.
+        Numbers of each row, with the time at which it was measured.
     """
 
     path: Path
@@ -63,7 +63,7 @@ class Record:
 
     @classmethod
     def open(cls, path: Path, run: dict[str, Any]) -> Record:
-        """Go on with the run in a file, if it is the same one, else begin anew."""
+        """Continue the run in a file if its stamp is the same, else start a new one."""
         try:
             known = json.loads(path.read_text())
         except (OSError, json.JSONDecodeError):
@@ -80,7 +80,7 @@ class Record:
         write_json(self.path, {"run": self.run, "rows": self.rows})
 
     def texts(self) -> list[str]:
-        """Say in Markdown when, where and with what the rows were measured."""
+        """Markdown that says when, where and with which versions the rows were measured."""
         if not self.rows:
             return ["Nothing has been measured yet."]
         times = sorted(row["when"] for row in self.rows.values())

@@ -1,4 +1,4 @@
-"""riley-raster, looking at a plane mesh the way modeharvest does: one sample in each pixel."""
+"""riley-raster for a plane mesh, with one sample in each pixel, as in modeharvest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 Render = Callable[[], FloatArray]
 
 BACKGROUND = -1e6
-"""Where there is no material; no field comes near it."""
+"""Value where there is no material, far from those of all fields."""
 _MESH_TYPE = {"T3": "tri3", "T6": "tri6", "Q4": "quad4", "Q8": "quad8", "Q9": "quad9"}
 
 
@@ -58,7 +58,7 @@ def _renderer(view: MeshView, shader: riley.Shader, threads: int) -> Render:
 
 
 def _camera(view: MeshView) -> riley.Camera:
-    """A pinhole straight above the plane sees it as it is, scaled: a pixel is a pixel of ours."""
+    """A pinhole camera straight above the plane, whose pixels are those of the grid."""
     grid = view.grid
     x = grid.x0 + 0.5 * (grid.cols - 1) * grid.pixel_size
     y = grid.y0 - 0.5 * (grid.rows - 1) * grid.pixel_size

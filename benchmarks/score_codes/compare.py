@@ -1,15 +1,15 @@
-"""Three DIC codes from PyPI, the whole displacement and micromorphic IDIC on a benchmark, scored.
+"""Score three DIC codes from PyPI, the whole displacement and micromorphic IDIC on a benchmark.
 
 Run: benchmarks/score_codes/run [--specimen paper|plate] [--pixel-size 0.02] [--strain 0.128]
      [--only CODE ...] [--standard DIR [--cases CASE ...] [--table]]
 
-Each code gets the public folder and nothing else: the 8-bit images, the mask, benchmark.json. Each
-returns a file, as anybody's would be, and 'modeharvest score' grades the files. All of it stays in
-out/score_codes, with the report. The specimens: the paper's, with 60 holes, and a plate with one.
+Each code gets the public folder: 8-bit images, mask, benchmark.json (IDIC also uses the paper's
+lattice). It returns a file in a public format, and 'modeharvest score' grades the files. All files
+and the report are in out/score_codes. Specimens: the paper's, with 60 holes, and a plate with one.
 
 --standard: instead, the cases of a set that 'modeharvest benchmark standard --out DIR' made, and
-their leaderboard; fields that are there already are kept, so it can be interrupted. With all codes
-and cases its table is written to docs/how-to/scoring.md, with --table that of the fields there are.
+their leaderboard; existing fields are kept, so that a run can be interrupted. With all codes and
+cases the table in docs/how-to/scoring.md is written, with --table that of the existing fields.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ import document  # noqa: E402
 OUT = HERE.parents[1] / "out" / "score_codes"
 SUBSET_PX, STEP_PX = 21, 5
 TIMEOUT_S = 600.0
-"""Far more than any code takes: it ends one that hangs."""
+"""Time limit, far longer than any code takes; for those that hang."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Task:
 
     @classmethod
     def read(cls, public: Path, strain: float) -> Task:
-        """Of a public folder."""
+        """Read the task of a public folder."""
         info: dict[str, Any] = json.loads((public / "benchmark.json").read_text("utf-8"))
         (entry,) = (d for d in info["deformed"] if abs(d["nominal_strain"] - strain) < 1e-9)
         corner = info["first_pixel_mm"]
@@ -97,12 +97,12 @@ class Task:
 
     @property
     def deformed_mask(self) -> np.ndarray:
-        """Material is nowhere black."""
+        """(rows, cols) True on the material of the deformed image, which is not black."""
         return np.asarray(self.deformed > 25)
 
 
 def correlated(task: Task) -> Result:
-    """Micromorphic IDIC with the paper's ansatz and start: it knows where the holes are."""
+    """Micromorphic IDIC with the paper's ansatz and start, and so its positions of holes."""
     how = SquareLatticeOptions()
     ansatz = how.ansatz(Specimen())
     guess = ansatz.initial_guess(task.strain, how.start_amplitude)
@@ -110,7 +110,7 @@ def correlated(task: Task) -> Result:
 
 
 def idic(task: Task, field: Path, codes: str) -> None:
-    """The ansatz alone."""
+    """Write the displacement of the ansatz alone."""
     found = correlated(task)
     step, grid = STEP_PX, task.grid
     row, col = np.mgrid[step // 2 : grid.rows : step, step // 2 : grid.cols : step]
@@ -119,20 +119,20 @@ def idic(task: Task, field: Path, codes: str) -> None:
 
 
 def whole(task: Task, field: Path, codes: str) -> None:
-    """The whole displacement from the ansatz' result on, as 'modeharvest run --whole-field'."""
+    """Write the whole displacement, started at the ansatz's result, as by 'run --whole-field'."""
     _write(task, field, measure_displacement(task.pair, correlated(task)))
 
 
 def _write(task: Task, field: Path, found: NodalResult) -> None:
-    """At every pixel of the material."""
+    """Write a displacement at every pixel of the material."""
     row, col = np.nonzero(task.mask)
     write_field(field, LocalField(*task.grid.to_mm(row, col), found.displacement_on()[row, col]))
 
 
 def measured(task: Task, field: Path, codes: str) -> None:
-    """The whole displacement as 'modeharvest measure' gives it for any images and their mask.
+    """Write the whole displacement as by 'modeharvest measure', from any images and their mask.
 
-    No law, no lattice, no mode is known to it, nor where the deformed image shows material.
+    It uses no law, lattice or mode, and does not know the material in the deformed image.
     """
     folder, pixel_size = field.parent / "measure", task.grid.pixel_size
     shutil.rmtree(folder, ignore_errors=True)
@@ -144,9 +144,9 @@ def measured(task: Task, field: Path, codes: str) -> None:
 
 
 def pyvale(filling: float) -> Callable[[Task, Path, str], None]:
-    """pyvale's subsets, as their own docs' 2-D DIC but for the first window.
+    """pyvale's subsets, with the options of its 2-D DIC documentation except for the first window.
 
-    Of their pixels at least so large a share must be material.
+    ``filling``: least share of a subset's pixels that must be material [-].
     """
 
     def run(task: Task, field: Path, codes: str) -> None:
@@ -158,7 +158,7 @@ def pyvale(filling: float) -> Callable[[Task, Path, str], None]:
 
 
 def other(script: str) -> Callable[[Task, Path, str], None]:
-    """A code that runs in the environment of the codes."""
+    """A measurement by a script, in the environment of the three codes."""
 
     def run(task: Task, field: Path, codes: str) -> None:
         field.parent.mkdir(parents=True, exist_ok=True)
@@ -193,15 +193,15 @@ PLATE = Experiment(
 )
 """A plate with a hole, 20 x 16 mm."""
 SPECIMENS = {"paper": 0.128, "plate": 0.06}
-"""With the nominal strain at which they are measured."""
+"""Nominal strains at which the specimens are measured [-]."""
 
 
 OTHER_SPECIMENS = ("ligaments-thick", "ligaments-thin", "irregular", "plate")
-"""Cases of the standard set without the paper's lattice, which two of the codes know."""
+"""Cases of the standard set without the paper's lattice, which two of the codes use."""
 
 
 def standard(public: Path, arguments: argparse.Namespace) -> None:
-    """Have every code measure the cases of a standard set; leaves a leaderboard."""
+    """Measure the cases of a standard set with every code; print and write a leaderboard."""
     handed_in, cases = OUT / "standard" / "codes", read_json(public / "summary.json")["cases"]
     wanted = () if arguments.table else arguments.cases or cases
     for case, code in product(wanted, arguments.only or CODES):

@@ -1,9 +1,9 @@
 """pyxel-dic on a public folder, without modeharvest: ``python pyxel_side.py PUBLIC IMAGE FIELD``.
 
-Finite-element DIC on triangles that pyxel makes of the mask, from its own start by optical flow
-(its multiscale start from zero did not find motions of 37 px on a pattern that repeats), then at
-full resolution with its weak regularisation over 30 px, then 15 px, then 8 px, each from the last.
-Pixels next to edges are left out: with 2 px instead of 4 elements at some holes diverged.
+Finite-element DIC on triangles that pyxel makes of the mask. The start is pyxel's optical flow (its
+multiscale start from zero did not find motions of 37 px on a repeating pattern). Then it runs at
+full resolution with weak regularisation over 30, 15 and 8 px, each from the previous result. 4 px
+next to edges are left out: with 2 px, elements at some holes diverged.
 """
 
 from __future__ import annotations

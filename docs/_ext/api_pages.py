@@ -1,4 +1,4 @@
-"""The Python API, a page for each package, drawn from docstrings when the site is built."""
+"""Pages of the Python API, one for each package, generated from docstrings at every build."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from sphinx.environment import BuildEnvironment
 
 SOURCE = Path(__file__).resolve().parents[2] / "src" / "modeharvest"
 COMMANDS = "cli"
-"""The package of the commands, which have a page of their own."""
+"""The package of the commands, which are documented on a separate page."""
 DEPTH = 3
-"""Of an API page's contents: the package, its modules, their classes and functions."""
+"""Levels in an API page's contents: the package, its modules, their classes and functions."""
 
 
 class IndexedDomain(PythonDomain):
-    """Python's objects, looked up among those of one last name; Sphinx goes through all of them."""
+    """The Python domain with an index by the last part of names; Sphinx searches all objects."""
 
     _count, _by_last_name = -1, dict[str, dict[str, Any]]()
 
     def find_obj(
         self, env: BuildEnvironment, modname: str, classname: str, name: str, *how: Any
     ) -> list[tuple[str, Any]]:
-        """See Sphinx."""
+        """Find objects as the base class does, among those with the same last part of the name."""
         every = self.data["objects"]
         if len(every) != self._count:
             self._count, self._by_last_name = len(every), {}
@@ -43,7 +43,7 @@ class IndexedDomain(PythonDomain):
 
 
 def packages(folder: Path = SOURCE) -> dict[str, list[str]]:
-    """Packages by dotted names, and the modules of each; not those of the commands."""
+    """Public modules of each package in a folder, by its dotted name, except the commands'."""
     found = {}
     for path in sorted(folder.iterdir()):
         if path.name != COMMANDS and (path / "__init__.py").exists():
@@ -54,13 +54,13 @@ def packages(folder: Path = SOURCE) -> dict[str, list[str]]:
 
 
 def first_line(path: Path) -> str:
-    """Of a module's docstring."""
+    """First line of a module's docstring."""
     text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
     return text.partition("\n")[0]
 
 
 def public_names() -> str:
-    """What ``import modeharvest as mh`` gives, as a page."""
+    """Page of the names that ``import modeharvest as mh`` provides."""
     import modeharvest
 
     page = heading("modeharvest")
@@ -71,7 +71,7 @@ def public_names() -> str:
 
 
 def draw(app: Sphinx) -> None:
-    """Write the pages."""
+    """Write the pages into the documentation's source."""
     folder = Path(app.srcdir) / FOLDER / "api"
     write(folder / "modeharvest.rst", public_names())
     for name, modules in packages().items():
@@ -84,14 +84,14 @@ def draw(app: Sphinx) -> None:
 
 
 def shorten_contents(_: Sphinx, env: BuildEnvironment) -> None:
-    """Leave members of classes out of the contents, which every page's sidebar copies."""
+    """Remove members of classes from the contents, which every page's sidebar contains."""
     for name, contents in env.tocs.items():
         if name.startswith(f"{FOLDER}/api/"):
             prune(contents, DEPTH)
 
 
 def prune(contents: Element, depth: int) -> None:
-    """Take off what is deeper in nested lists."""
+    """Remove the items of nested lists that are deeper than ``depth``."""
     for item in contents.children:
         for part in [part for part in item.children if isinstance(part, bullet_list)]:
             if depth > 1:
@@ -103,20 +103,20 @@ def prune(contents: Element, depth: int) -> None:
 def leave_titles(app: Sphinx, page: str, *_: Any) -> None:
     """Hide the contents of other pages while furo makes a sidebar of their titles.
 
-    Sphinx would copy the contents of all pages for every page, and leave them out then.
+    Otherwise Sphinx copies the contents of all pages for every page, only to remove them later.
     """
     for name in app.env.metadata.keys() - app.env.toctree_includes.keys() - {page}:
         app.env.metadata[name]["tocdepth"] = 1
 
 
 def show_contents(app: Sphinx, *_: Any) -> None:
-    """Undo that, before the next page's own contents are made."""
+    """Undo :func:`leave_titles` before the contents of the next page are made."""
     for about in app.env.metadata.values():
         about.pop("tocdepth", None)
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Have the pages written before any is read."""
+    """Register the extension: pages are written before Sphinx reads any."""
     app.add_domain(IndexedDomain, override=True)
     app.connect("builder-inited", draw)
     app.connect("env-updated", shorten_contents)

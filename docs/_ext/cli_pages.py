@@ -1,4 +1,4 @@
-"""The command line, drawn from typer's own commands when the site is built."""
+"""The page of the command line, generated from the commands at every build of the site."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from sphinx.application import Sphinx
 
 
 def plain(text: str | None) -> str:
-    """Help without the marks that make it bold, and safe in reStructuredText."""
+    """Help text without marks for bold type, escaped for reStructuredText."""
     text = re.sub(r"\[/?bold\]", "", text or "")
     text = re.sub(r"([*_`|\\])", r"\\\1", text)
-    # Outside literals two dashes would become one.
+    # Outside literals, two dashes would be shown as one.
     return re.sub(r"(?<![\w-])(--[a-z]+(?:-[a-z]+)*(?:=\w+)?)", r"``\1``", text)
 
 
 def parameters(command: Any) -> Iterator[tuple[str, str, str]]:
-    """Names, default and help of each argument and option."""
+    """Names, default and help text of each argument and option of a command."""
     for parameter in command.params:
         if parameter.name == "help":
             continue
@@ -38,7 +38,7 @@ def parameters(command: Any) -> Iterator[tuple[str, str, str]]:
 
 
 def section(name: str, command: Any, mark: str = "-") -> str:
-    """A command: what it does, its arguments and options."""
+    """Section of a command and its subcommands: help text, arguments, options."""
     page = heading(name, mark) + plain(command.help) + "\n\n"
     if hasattr(command, "commands"):
         return page + "".join(section(f"{name} {n}", c, "~") for n, c in command.commands.items())
@@ -48,7 +48,7 @@ def section(name: str, command: Any, mark: str = "-") -> str:
 
 
 def draw(app: Sphinx) -> None:
-    """Write the page."""
+    """Write the page into the documentation's source."""
     from modeharvest.cli.root import app as root
 
     command = typer.main.get_command(root)
@@ -60,6 +60,6 @@ def draw(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Have the page written before any is read."""
+    """Register the extension: the page is written before Sphinx reads any."""
     app.connect("builder-inited", draw)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""The project's docstrings made reStructuredText: lists of arguments, bars, and underscores."""
+"""Conversion of the project's docstrings to reStructuredText: arguments, bars, underscores."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LITERAL = re.compile(r"(``.*?``|:\w+:`[^`]*`)")
 
 
 def escaped(line: str) -> str:
-    """Bars of absolute values and underscores at a word's end stand for themselves."""
+    """The line with bars (absolute values) and underscores at the end of words escaped."""
     parts = LITERAL.split(line)
     for k in range(0, len(parts), 2):
         parts[k] = re.sub(r"\|", r"\\|", parts[k])
@@ -22,7 +22,7 @@ def escaped(line: str) -> str:
 
 
 def with_fields(paragraph: list[str]) -> list[str]:
-    """A list of arguments, ``name : what it is`` and indented lines, as fields."""
+    """A list of arguments, ``name : meaning`` with indented lines, as fields; others unchanged."""
     if not paragraph or not ARGUMENT.match(paragraph[0]):
         return paragraph
     if not all(ARGUMENT.match(line) or line.startswith("    ") for line in paragraph):
@@ -40,7 +40,7 @@ def with_fields(paragraph: list[str]) -> list[str]:
 
 
 def paragraphs(lines: Iterable[str]) -> list[list[str]]:
-    """Lines between blank ones."""
+    """Groups of lines that are separated by blank lines."""
     found: list[list[str]] = [[]]
     for line in lines:
         if line.strip():
@@ -51,7 +51,7 @@ def paragraphs(lines: Iterable[str]) -> list[list[str]]:
 
 
 def process(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: list[str]) -> None:
-    """Rewrite a docstring's lines in place."""
+    """Convert a docstring's lines in place, except indented literal blocks."""
     numpy_style = any(re.fullmatch(r"\s*-{4,}", line) for line in lines)
     out: list[str] = []
     verbatim = False
@@ -72,7 +72,7 @@ def process(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: lis
 
 
 def restore(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: list[str]) -> None:
-    """Napoleon takes what stands before a colon for the type of an attribute: put it back."""
+    """Undo napoleon's reading of the text before a colon as an attribute's type."""
     if what in ("attribute", "data", "property"):
         for k, line in enumerate(lines):
             if line.startswith(":type: "):
@@ -81,7 +81,7 @@ def restore(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: lis
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Before and after napoleon, whose priority is 500."""
+    """Register the functions before and after napoleon, whose priority is 500."""
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-process-docstring", restore, priority=600)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,7 +1,7 @@
-"""Every key of every kind of case file: type, unit, default, range, meaning, from the models.
+"""Pages of all keys of case files, made from the models: type, unit, default, range, meaning.
 
-Ranges are found by trying: a key takes values, beside the defaults of all others, until the
-model's own checks refuse them.
+Ranges are found by trial: values of a key, with the defaults of all other keys, are tried until the
+model's checks reject them.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ CHOICES: dict[str, dict[str, type[Any]]] = {
     "material": MATERIALS, "lattice": LATTICES, "mode": MODES, "study": KINDS,
     "distortion": {"camera": CameraDistortion},
 }  # fmt: skip
-"""Tables that a key ``kind`` chooses the keys of."""
+"""Tables whose keys depend on a key ``kind``: the classes of the kinds, by the table's name."""
 EXAMPLES: dict[type[Any], dict[str, Any]] = {
     Images: {"reference": "reference.tif", "deformed": ("frame_1.tif",)},
     ImageScale: {"pixel_size": 0.01},
@@ -56,11 +56,11 @@ EXAMPLES: dict[type[Any], dict[str, Any]] = {
     LogTable: {"file": "log.csv"},
     MeasuredData: {"reference": "reference.tif", "deformed": ("f.tif",), "pixel_size": 0.01},
 }
-"""Values of keys that have no default."""
+"""Example values of the keys that have no default, by class."""
 MEANINGS: dict[str, dict[str, str]] = tomllib.loads(
     Path(__file__).with_name("keys.toml").read_text("utf-8")
 )
-"""Of keys whose classes don't say it for each alone."""
+"""Meanings of keys whose classes have no separate docstring for each, by class."""
 NUMBERS = sorted(
     sign * value
     for value in (0.0, 1e-9, 1e-6, 1e-3, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, *range(1, 17), 20.0, 30.0,
@@ -71,7 +71,7 @@ FARTHEST = 1e9
 
 
 def docstrings(cls: type[Any]) -> dict[str, str]:
-    """What stands below the fields of a class and of those it derives from, or in its docstring."""
+    """Meanings by field of a class and its bases: below fields, in docstrings, or ``MEANINGS``."""
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if base.__module__.startswith("modeharvest"):
@@ -80,7 +80,7 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
 
 
 def below_fields(cls: type[Any]) -> dict[str, str]:
-    """Neighbours share the docstring below the last of them."""
+    """Docstrings below the fields of a class; neighbours share the one below the last of them."""
     body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # type: ignore[attr-defined]
     found: dict[str, str] = {}
     waiting: list[str] = []
@@ -96,7 +96,7 @@ def below_fields(cls: type[Any]) -> dict[str, str]:
 
 
 def in_parameters(cls: type[Any]) -> dict[str, str]:
-    """Of a numpy-style block of parameters."""
+    """Meanings in the numpy-style block of parameters of a class' docstring."""
     text = inspect.cleandoc(cls.__doc__ or "")
     if "Parameters\n---" not in text:
         return {}
@@ -108,7 +108,7 @@ def in_parameters(cls: type[Any]) -> dict[str, str]:
 
 
 def unit(name: str, about: str, kind: str) -> str:
-    """As the name or the text in brackets says."""
+    """Unit of a number by the ending of its name, or by the last brackets of its meaning."""
     if kind not in ("number", "whole number", "list") and "number" not in kind:
         return ""
     for ending, known in (("_px", "px"), ("_mm", "mm"), ("_N", "N"), ("_N_per_mm", "N/mm"),
@@ -120,7 +120,7 @@ def unit(name: str, about: str, kind: str) -> str:
 
 
 def plain_type(hint: Any) -> str:
-    """A type as a TOML file has it."""
+    """Name of the TOML type for a Python type."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return plain_type(inner[0])
@@ -139,7 +139,7 @@ def plain_type(hint: Any) -> str:
 
 
 def literal(value: Any) -> str:
-    """A default as TOML writes it."""
+    """A default value in TOML's notation."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (tuple, list)):
@@ -148,7 +148,7 @@ def literal(value: Any) -> str:
 
 
 def accepted(prototype: Any, name: str, hint: Any) -> str:
-    """The values that the checks let pass, beside the prototype's for other keys."""
+    """The values of a key that the checks accept, with the prototype's values of other keys."""
     kinds = plain_type(hint)
     choices = [v for k in (hint, *get_args(hint)) if get_origin(k) is Literal for v in get_args(k)]
     if choices:
@@ -171,7 +171,7 @@ def accepted(prototype: Any, name: str, hint: Any) -> str:
 
 
 def refusal(prototype: Any, name: str, value: Any) -> str:
-    """Why a value is not taken; "" if it is."""
+    """The error message of the checks for a value; "" if it is accepted."""
     try:
         replace(prototype, **{name: value})
     except (ValueError, TypeError, ArithmeticError, KeyError) as error:
@@ -180,7 +180,7 @@ def refusal(prototype: Any, name: str, value: Any) -> str:
 
 
 def interval(is_fine: Callable[[float], bool], whole: bool) -> str:
-    """The interval of fine numbers, in words."""
+    """Text of the interval of accepted numbers; "" if there is none or no bound."""
     tried = [n for n in NUMBERS if not whole or n == int(n)]
     fine = [n for n in tried if is_fine(n)]
     if not fine:
@@ -201,7 +201,7 @@ def interval(is_fine: Callable[[float], bool], whole: bool) -> str:
 def edge(
     is_fine: Callable[[float], bool], fine: float, beyond: list[float], whole: bool
 ) -> float | None:
-    """Where fine numbers end between one that is and one that is not; None: nowhere."""
+    """The bound between an accepted and a rejected number, by bisection; None if none rejected."""
     if not beyond:
         return None
     bad = beyond[0]
@@ -217,7 +217,7 @@ def edge(
 
 
 def prototype(cls: type[Any]) -> Any:
-    """One of a class, all by default; None if it can't be made without more."""
+    """An instance of a class with defaults and ``EXAMPLES``; None if these don't suffice."""
     try:
         return cls(**EXAMPLES.get(cls, {}))
     except (TypeError, ValueError):
@@ -225,7 +225,7 @@ def prototype(cls: type[Any]) -> Any:
 
 
 def nested(hint: Any) -> type[Any] | None:
-    """The dataclass that a table of this type is made to."""
+    """The dataclass in a type hint, from which a table is read; None if there is none."""
     for kind in (hint, *get_args(hint), *(k for h in get_args(hint) for k in get_args(h))):
         if isinstance(kind, type) and is_dataclass(kind) and not issubclass(kind, CameraDistortion):
             return kind
@@ -233,7 +233,7 @@ def nested(hint: Any) -> type[Any] | None:
 
 
 def sections(cls: type[Any], path: str) -> Iterator[tuple[str, type[Any], str]]:
-    """Tables by their names in a file, the class of each, and what chooses it."""
+    """Tables of a class and below it: name in a file, class, and the ``kind`` that chooses it."""
     yield path, cls, ""
     hints = get_type_hints(cls, include_extras=True)
     for f in fields(cls):
@@ -241,7 +241,7 @@ def sections(cls: type[Any], path: str) -> Iterator[tuple[str, type[Any], str]]:
 
 
 def below(name: str, hint: Any, path: str) -> Iterator[tuple[str, type[Any], str]]:
-    """The tables of a key that is a table itself."""
+    """The tables of a key whose value is a table; none for other keys."""
     if name in CHOICES and plain_type(hint) != "text":
         for kind, cls in CHOICES[name].items():
             yield path, cls, kind
@@ -273,12 +273,12 @@ def keys(cls: type[Any], path: str) -> Iterator[tuple[str, ...]]:
 
 
 def escaped(text: str) -> str:
-    """Not to be taken for marks of reStructuredText."""
+    """The text with the special characters of reStructuredText escaped."""
     return re.sub(r"([*_`|\\])", r"\\\1", text)
 
 
 def tables(model: type[CaseModel]) -> Iterator[tuple[str, type[Any]]]:
-    """All tables of a kind of case by their names in a file, with the class of each."""
+    """All tables of a kind of case: name in a file, and class."""
     hints = get_type_hints(model, include_extras=True)
     for name in model.model_fields:
         yield from ((path, cls) for path, cls, _ in below(name, hints[name], name))
@@ -288,7 +288,7 @@ HEAD = "key", "type", "unit", "default", "range", "meaning"
 
 
 def page(title: str, model: type[CaseModel], command: str, others: dict[type[Any], str]) -> str:
-    """All tables of a kind of case; those that another page has are linked to."""
+    """Page of all tables of a kind of case, with links to tables on an earlier page."""
     text = heading(title)
     for name in command.split(" and "):
         text += f"Run by ``modeharvest {name}``. "
@@ -325,12 +325,12 @@ def page(title: str, model: type[CaseModel], command: str, others: dict[type[Any
 
 
 def label_of(path: str, cls: type[Any]) -> str:
-    """By which a table is linked to."""
+    """Label for links to a table."""
     return f"keys-{path}-{cls.__name__}".lower().replace(".", "-")
 
 
 def draw(app: Sphinx) -> None:
-    """Write the pages."""
+    """Write the pages into the documentation's source."""
     others: dict[Any, str] = {}
     for name, (title, model, command) in CASES.items():
         text = page(title, model, command, others)
@@ -338,6 +338,6 @@ def draw(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Have the pages written before any is read."""
+    """Register the extension: pages are written before Sphinx reads any."""
     app.connect("builder-inited", draw)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""Equations as MathML, which browsers draw by themselves: no script, no font, no network."""
+"""Equations as MathML, which browsers draw without a script, a font, or the network."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _mathml(latex: str, display: str) -> str:
         raise ExtensionError(f"an equation can't be converted: {latex!r}: {error}") from error
     if unknown := re.search(r">\\(\w+)<", found):
         raise ExtensionError(f"an equation can't be converted: {latex!r}: \\{unknown[1]}")
-    # Browsers would take letters from the block of mathematical italics, which few fonts have.
+    # Without the class, browsers use letters of mathematical italics, which few fonts have.
     return re.sub(r"<mi>(\w|&#x0*3[0-9A-Fa-f]{2};)</mi>", r'<mi class="letter">\1</mi>', found)
 
 
@@ -38,6 +38,6 @@ def _block(self: Any, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the renderer."""
+    """Register the renderer of equations."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,7 +1,7 @@
-"""What commands leave for programs: JSON schemas and pages of keys, from types and a table.
+"""JSON schemas and pages of keys of the JSON files that commands write.
 
-``summaries.toml`` beside this file names each key with its type and meaning; dataclasses that a
-command writes as they are speak for themselves.
+``summaries.toml`` beside this file has the type and the meaning of each key. For dataclasses that a
+command writes unchanged, these come from the fields and their docstrings.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ COMMANDS: dict[str, dict[str, Any]] = tomllib.loads(
     Path(__file__).with_name("summaries.toml").read_text("utf-8")
 )
 FILES = {"score": "scores.json"}
-"""Of those that don't write ``summary.json``."""
+"""JSON files of the commands that don't write ``summary.json``."""
 none = type(None)
 PLAIN: dict[Any, dict[str, Any]] = {
     "text": {"type": "string"}, "number": {"type": ["number", "null"]},
@@ -36,13 +36,13 @@ PLAIN: dict[Any, dict[str, Any]] = {
     str: {"type": "string"}, float: {"type": ["number", "null"]}, int: {"type": "integer"},
     bool: {"type": "boolean"}, none: {"type": "null"},
 }  # fmt: skip
-"""By the words of the table and by Python's types; no number is null: unknown, or infinite."""
+"""Schemas by type name in the table or Python type; null: number unknown or infinite."""
 LISTS = (tuple, list, collections.abc.Sequence)
 TABLES = (dict, collections.abc.Mapping)
 
 
 class Schema:
-    """The JSON schema of what a command leaves."""
+    """The JSON schema of the file that a command writes."""
 
     def __init__(self, command: str) -> None:
         self.given = COMMANDS[command]
@@ -57,7 +57,7 @@ class Schema:
         }
 
     def of_table(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Of a table of ``summaries.toml``."""
+        """Schema of a table of ``summaries.toml``."""
         found: dict[str, Any] = {"type": "object", "properties": {}, "required": []}
         for name in given.get("as", ()):
             own = self.of_class(imported(name.rstrip("?")), given)
@@ -72,7 +72,7 @@ class Schema:
         return {**found, "required": sorted(set(found["required"])), "additionalProperties": False}
 
     def of_name(self, kind: str) -> dict[str, Any]:
-        """Of a type as ``summaries.toml`` writes it."""
+        """Schema of a type in the notation of ``summaries.toml``."""
         if kind.endswith("?"):
             return {"anyOf": [self.of_name(kind[:-1]), PLAIN[none]]}
         if kind.endswith("[]"):
@@ -87,7 +87,7 @@ class Schema:
         return {"$ref": f"#/$defs/{kind}"}
 
     def of_class(self, cls: type[Any], without: Container[str] = ()) -> dict[str, Any]:
-        """Of a dataclass; fields with a default may be missing."""
+        """Schema of a dataclass, except fields ``without``; those with a default may be missing."""
         texts, hints = docstrings(cls), get_type_hints(cls)
         found = {}
         chosen = [f for f in fields(cls) if f.name not in without]
@@ -101,7 +101,7 @@ class Schema:
                 "additionalProperties": False}  # fmt: skip
 
     def of_hint(self, hint: Any) -> dict[str, Any]:
-        """Of a type as Python writes it."""
+        """Schema of a Python type hint."""
         origin, inner = get_origin(hint), get_args(hint)
         if hint in PLAIN:
             return dict(PLAIN[hint])
@@ -130,14 +130,14 @@ class Schema:
 
 
 def imported(name: str) -> type[Any]:
-    """A dataclass by ``module:Class``."""
+    """The dataclass with the name ``module:Class``, imported."""
     module, _, cls = name.partition(":")
     found: type[Any] = getattr(importlib.import_module(module), cls)
     return found
 
 
 def kind_text(schema: dict[str, Any], command: str) -> str:
-    """A type in words, with a link to the table that it is."""
+    """A type in words; if it is a table of this page, a link to it."""
     if "$ref" in schema:
         name = schema["$ref"].rsplit("/", 1)[1]
         return f":ref:`{name} <summary-{command}-{name.lower()}>`"
@@ -167,7 +167,7 @@ def rows(schema: dict[str, Any], command: str) -> list[tuple[str, str, str, str]
 
 
 def page(command: str, schema: dict[str, Any]) -> str:
-    """All keys that a command leaves."""
+    """Page of all keys of the file that a command writes."""
     head, widths = ("key", "type", "unit", "meaning"), "24 20 12 44"
     text = f".. _summary-{command}:\n\n" + heading(schema["title"])
     text += re.sub(r"`([^`]*)`", r"``\1``", schema["description"])
@@ -181,7 +181,7 @@ def page(command: str, schema: dict[str, Any]) -> str:
 
 
 def draw(app: Sphinx) -> None:
-    """Write schemas and pages."""
+    """Write schemas and pages into the documentation's source."""
     for command in COMMANDS:
         schema, folder = Schema(command).top, Path(app.srcdir) / FOLDER
         text = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
@@ -190,6 +190,6 @@ def draw(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Have them written before any page is read."""
+    """Register the extension: schemas and pages are written before Sphinx reads any."""
     app.connect("builder-inited", draw)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

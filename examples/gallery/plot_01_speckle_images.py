@@ -2,8 +2,8 @@
 Speckle images whose displacement is known
 ==========================================
 
-Images of the paper's specimen before loading, before and after buckling. Each comes with the true
-displacement of every pixel, which the last panel shows.
+Images of the paper's specimen before loading, before buckling, and after buckling. The true
+displacement of every pixel is known; the last panel shows it for the last image.
 """
 
 import tempfile
@@ -15,11 +15,11 @@ import modeharvest as mh
 from modeharvest.runs.case import shipped_solution
 
 solution = mh.Solution.read(shipped_solution("paper-virtual"))
-spec = mh.ImagingSpec(pixel_size=0.03)  # [mm/px]; the paper has 0.01
+spec = mh.ImagingSpec(pixel_size=0.03)  # [mm/px]; 0.01 in the paper
 images = mh.make_images(solution, spec, tempfile.mkdtemp())
 
 # %%
-# Compression is along x. The pattern of alternating ellipses appears beyond 9.6 %.
+# Compression is along x. The pattern of alternating ellipses appears above 9.6 % of strain.
 
 fig, axes = plt.subplots(1, 4, figsize=(12, 4.2), layout="constrained")
 axes[0].imshow(images.reference(), cmap="gray")

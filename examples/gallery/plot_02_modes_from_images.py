@@ -2,8 +2,8 @@
 Measure a pattern by micromorphic IDIC
 ======================================
 
-The displacement is u = v₀ + v₁φ₁: a smooth part, and an amplitude times a periodic mode. All 77
-unknowns are found at once, from the grey levels of two images.
+The displacement is u = v₀ + v₁φ₁: a smooth field, plus a smooth amplitude times a periodic mode.
+All 77 unknowns are found together from the grey levels of two images.
 """
 
 import tempfile
@@ -23,7 +23,7 @@ print(result.outcome.name, result.iterations, "iterations")
 print("mode parameters", np.round(result.mode_parameters(), 4))
 
 # %%
-# The three fields that homogenization asks for: v₀, the amplitude v₁, and the mode φ₁.
+# The three fields that homogenization needs: v₀, v₁ and φ₁. The last panel is the pattern v₁φ₁.
 
 material = np.where(pair.mask, 1.0, np.nan)
 fields = {

@@ -2,9 +2,9 @@
 How large the errors are, and where they come from
 ==================================================
 
-With the truth at every pixel the error splits in two: what the ansatz can't describe (the
-microfluctuation field w, the distance of its best possible fit from the truth), and what the
-correlation adds (IDIC less that best fit).
+With the truth known at every pixel, the error truth − IDIC is split in two parts: the model error,
+truth − best fit, which remains in the best possible fit of the ansatz to the truth, and the
+measurement error, IDIC − best fit, which the correlation adds.
 """
 
 import tempfile
@@ -25,12 +25,12 @@ best = mh.best_fit(pair.truth, result)
 true, found, possible = pair.truth.displacement, result.displacement(), best.displacement()
 parts = {
     "truth − IDIC": true - found,
-    "truth − best fit: w": true - possible,
+    "truth − best fit": true - possible,
     "IDIC − best fit": found - possible,
 }
 
 # %%
-# Numbers are rms per component.
+# The numbers are rms values per component.
 
 fig, axes = plt.subplots(1, 3, figsize=(11, 4.6), layout="constrained")
 for ax, (name, error) in zip(axes, parts.items(), strict=True):

@@ -2,8 +2,8 @@
 The whole displacement, up to every edge
 ========================================
 
-What the ansatz leaves can be measured: by finite elements on a mesh of the material that is made
-from the mask. Every value has a standard deviation.
+The part of the displacement that the ansatz can't describe is measured by finite elements on a mesh
+of the material, made from the mask. Every value has a standard deviation.
 """
 
 import tempfile
@@ -28,7 +28,7 @@ error = (whole.displacement_on() - pair.truth.displacement) / PIXEL
 print(f"{whole.unknowns} unknowns; rms error {np.sqrt(np.nanmean(error[pair.mask] ** 2)):.3f} px")
 
 # %%
-# The same microfluctuation field w as in the truth, its error, and the error that is predicted.
+# The measured microfluctuation field w, the true error, and the predicted standard deviation.
 
 w = np.linalg.norm(whole.displacement_on() - result.displacement(), axis=-1) / PIXEL
 panels = {

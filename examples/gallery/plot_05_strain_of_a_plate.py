@@ -2,10 +2,10 @@
 Strain of a speckled plate with a hole
 ======================================
 
-No lattice and no mode: ``measure`` needs two images and gives displacement and strain up to the
-edge of the hole, with standard deviations. The images here are made from a formula that stretches
-and bends the plate as if there were no hole: strain doesn't concentrate there, as it would in a
-loaded plate.
+``measure`` assumes neither a lattice nor a mode. It needs two images and gives displacement and
+strain up to the edge of the hole, with standard deviations. These images are made from a formula
+that stretches and bends the plate as if there were no hole: so there is no concentration of strain
+at the hole, unlike in a loaded plate.
 """
 
 import tempfile
@@ -27,7 +27,7 @@ speckle = Speckle(SpeckleSpec(standard_deviation=0.08, blur_px=2.0), shape)
 
 
 def stretched(values):
-    """Where points of the deformed image were: stretched by 4 % along x, bent a little."""
+    """Reference positions of points of the deformed image: stretch of 4 % along x, and bending."""
     return values / 1.04, y - 0.0004 * values**2 / 1.04
 
 
@@ -41,9 +41,9 @@ numbers = summary["images"][0]
 print({key: numbers[key] for key in ("rms_px", "median_sd_px", "coverage", "cutoff_px")})
 
 # %%
-# The result for ParaView is a mesh with all fields at its nodes; matplotlib draws it as well. By
-# the formula the strain along x is 4.1 % in the middle and 4.7 % at both ends, where the plate is
-# bent most.
+# The file for ParaView has the mesh and all fields at its nodes; matplotlib can draw them, too.
+# According to the formula, the strain along x is 4.1 % in the middle and 4.7 % at both ends, where
+# the bent plate has the largest slope.
 
 mesh = meshio.read(folder / "out/results/deformed.vtu")
 E = np.asarray(mesh.point_data["green_lagrange"]).reshape(len(mesh.points), -1)[:, 0]

@@ -2,8 +2,8 @@
 From photographs to modes with error bars
 =========================================
 
-Photographs, the size of a pixel and of a cell are all that ``harvest`` needs. Holes, lattice,
-noise, mode family and initial guess are found. Photographs here are rendered, with 1 % of noise.
+``harvest`` needs only photographs, the pixel size and the cell size. It finds holes, lattice,
+noise, mode family and initial guess. The photographs here are rendered, with 1 % of noise.
 """
 
 import shutil
@@ -27,7 +27,7 @@ for path in (folder / "images").glob("*_8bit.tif"):
 print(sorted(path.name for path in folder.glob("*.tif")))
 
 # %%
-# The whole experiment is a file of a few lines.
+# A file of a few lines describes the experiment.
 
 experiment = """
 [images]
@@ -42,8 +42,8 @@ cell_size = 1.9                # mm
 summary = mh.harvest(folder / "experiment.toml", folder / "out")
 
 # %%
-# Standard deviations by the camera's noise, and by model error. a1 to a5 are numbers, a6 and a7
-# lengths.
+# Standard deviations due to the camera's noise, and due to model error with noise. a1 to a5 are
+# dimensionless, a6 and a7 are lengths.
 
 mode = summary["frames"][-1]["modes"][0]
 print(summary["frames"][-1]["outcome"], "in", summary["frames"][-1]["iterations"], "iterations")

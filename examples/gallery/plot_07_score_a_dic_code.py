@@ -2,8 +2,8 @@
 Grade a DIC code
 ================
 
-Benchmark images go to any code; what comes back is graded against the truth. Two small codes
-compete here: scikit-image's optical flow with small and with large windows.
+Any code can measure the benchmark images; its displacements are graded against the truth. Here, two
+small codes are compared: scikit-image's optical flow with small and with large windows.
 """
 
 import tempfile
@@ -25,7 +25,7 @@ make_benchmark(case, folder / "bench", solution=shipped_solution("paper-virtual"
 print(sorted(path.name for path in (folder / "bench").iterdir()))
 
 # %%
-# The code under test sees the public folder only. It returns displacements on a grid of points.
+# The tested code reads only the public folder. It returns displacements on a grid of points.
 
 reference = read_image(folder / "bench/reference.tif")
 deformed = read_image(folder / "bench/deformed_0780.tif")
@@ -38,9 +38,9 @@ for radius in (5, 15):
 
 # %%
 # ``modeharvest score flow.csv --y-axis down --truth bench-truth --strain 0.078 --out graded`` does
-# the same. Axes and first pixel are declared where the file doesn't say them. Of the regions only
-# those with points are drawn: ligaments are 6 px wide in these small images, and all that is within
-# 10 px of an edge counts as edge.
+# the same. Axes and first pixel are declared if the file doesn't state them. Only regions with
+# points are drawn: ligaments are 10 px wide in these small images, and all material within 10 px of
+# an edge counts as edge.
 
 declared = {folder / f"flow_{r}.csv": Declared(y_axis="down") for r in (5, 15)}
 grading = score(declared, folder / "bench-truth", 0.078, folder / "graded")

@@ -2,8 +2,8 @@
 Do the error bars hold?
 =======================
 
-The same pair of images with twelve samples of camera noise: the scatter of the results beside the
-standard deviations that each result predicts from its own images.
+One pair of images is measured with twelve samples of camera noise. The scatter of the results is
+compared with the standard deviations that each result predicts from its own images.
 """
 
 import tempfile
@@ -14,14 +14,14 @@ import numpy as np
 import modeharvest as mh
 from modeharvest.runs.case import shipped_solution
 
-SD = 0.02  # of full scale
+SD = 0.02  # [fraction of full scale]
 solution = mh.Solution.read(shipped_solution("paper-virtual"))
 images = mh.make_images(solution, mh.ImagingSpec(pixel_size=0.05), tempfile.mkdtemp(), [0.128])
 pair, ansatz = images.pair(0.128), mh.Ansatz.square(solution.specimen)
 start = mh.correlate(pair, ansatz)
 
 # %%
-# Each sample starts from the result without noise.
+# The initial guess of each sample is the result without noise.
 
 rng = np.random.default_rng(1)
 samples, predicted = [], []

@@ -2,8 +2,8 @@
 Calibrate a lens with a shifted target
 ======================================
 
-Five photographs of a speckle target that a stage has shifted, by unknown amounts, determine the
-distortion of the lens to a hundredth of a pixel or better.
+Five photographs of a speckle target, shifted by a stage by unknown amounts, determine the
+distortion of the lens with an error of a hundredth of a pixel or less.
 """
 
 import matplotlib.pyplot as plt
@@ -17,7 +17,7 @@ shape = (160, 200)
 lens = CameraDistortion(fx=250.0, fy=250.0, cx=99.5, cy=79.5, k1=-0.06)
 target = Speckle(SpeckleSpec(standard_deviation=0.08, blur_px=1.5), (320, 400))
 row, col = np.mgrid[: shape[0], : shape[1]].astype(float)
-ideal_row, ideal_col = lens.ideal(row, col)  # where a point of the photograph would be without lens
+ideal_row, ideal_col = lens.ideal(row, col)  # positions without distortion
 shifts = [(0, 0), (22, 3), (-20, 5), (4, 24), (-5, -23)]
 photographs = [target.exact(ideal_row + 80 - r, ideal_col + 100 - c) for r, c in shifts]
 
@@ -25,8 +25,8 @@ found = calibrate(photographs, options=CalibrationOptions(degrees=(2, 3, 4)))
 print("degree", found.distortion.degree, "shifts found", np.round(found.shifts, 2).tolist())
 
 # %%
-# Barrel distortion moves what is seen towards the centre. Scale and skew can't be seen in unknown
-# shifts; both fields are shown without them.
+# Barrel distortion moves image points towards the centre. With unknown shifts, scale and skew
+# can't be determined; they are removed from both fields. Arrows: the measured distortion.
 
 at = np.mgrid[10:150:14, 10:190:14].astype(float)
 true = np.stack(without_affine(lens, shape).shift(*at))

@@ -2,7 +2,7 @@
 Find material, holes and lattice in a photograph
 ================================================
 
-Speckle is separated from its background, hole centres are located, and a lattice is fitted to them.
+Speckled material is separated from the background, and a lattice is fitted to the hole centres.
 """
 
 import tempfile
@@ -16,7 +16,7 @@ from modeharvest.idic.photograph.material import find_material
 from modeharvest.runs.case import shipped_solution
 
 solution = mh.Solution.read(shipped_solution("paper-virtual"))
-spec = mh.ImagingSpec(pixel_size=0.03, background=0.45)  # grey: neither dark nor bright
+spec = mh.ImagingSpec(pixel_size=0.03, background=0.45)  # neither dark nor bright
 images = mh.make_images(solution, spec, tempfile.mkdtemp(), [0.078])
 photograph = images.reference(camera=True)
 photograph = photograph + 0.01 * np.random.default_rng(0).standard_normal(photograph.shape)
@@ -28,7 +28,7 @@ print(f"{100 * wrong:.2f} % of the pixels are wrong")
 print(f"{len(lattice)} holes, {lattice.kind}, {lattice.pitch_px:.1f} px apart")
 
 # %%
-# Material in colour, holes as found.
+# The material in colour, and the centres of the holes that were found.
 
 fig, ax = plt.subplots(figsize=(5.2, 6), layout="constrained")
 ax.imshow(photograph, cmap="gray")

@@ -2,8 +2,8 @@
 Read the field of another DIC code, and its spectrum
 ====================================================
 
-A table of positions and displacements, as VIC, DICe, DaVis or GOM export it, becomes a field; its
-spectral density shows the waves of the pattern.
+A table of positions and displacements, as exported by VIC, DICe, DaVis or GOM, is read as a field.
+Its spectral density shows the waves of the pattern.
 """
 
 import tempfile
@@ -23,8 +23,8 @@ images = mh.make_images(solution, mh.ImagingSpec(pixel_size=0.03), folder / "ima
 pair = images.pair(0.128)
 
 # %%
-# A file as another code would write it: every fifth pixel, y down, px, a ``sigma`` below zero where
-# the code has failed.
+# A file as another code would write it: every fifth pixel along both axes, y down, lengths in px,
+# and a negative ``sigma`` where the code has failed.
 
 rows, cols = np.nonzero(pair.mask & (np.indices(pair.mask.shape) % 5 == 0).all(axis=0))
 u = pair.truth.displacement[rows, cols] / pair.grid.pixel_size
@@ -36,8 +36,8 @@ field = read_field(folder / "vic.csv", pair.grid, units="px", y_axis="down")
 print(f"{field.x.size} points, {field.lost} of them failed, rms {field.rms:.3f} mm")
 
 # %%
-# Peaks at half a wave a cell along both axes: neighbouring holes deform in opposite ways. Colours
-# show the four decades below the largest.
+# The peaks are at half a wave per cell along both axes: neighbouring holes deform in opposite ways.
+# The colours show the four decades below the largest density.
 
 spectrum = measured_spectrum(field, solution.specimen.pitch)
 xi1, xi2, density = spectrum.window(1.2)

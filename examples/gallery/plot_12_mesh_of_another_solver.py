@@ -2,8 +2,8 @@
 Images of another solver's mesh
 ===============================
 
-Any plane mesh of T3, T6, Q4, Q8 or Q9 elements with nodal displacements, in a format that meshio
-reads (Abaqus, VTU, XDMF, ...), can be imaged. Here: a beam of Q4 elements under bending.
+Images can be made of any plane mesh of T3, T6, Q4, Q8 or Q9 elements with nodal displacements, in a
+format that meshio reads (Abaqus, VTU, XDMF, ...). This example is a beam of Q4 elements in bending.
 """
 
 import tempfile
@@ -17,7 +17,7 @@ import modeharvest as mh
 from modeharvest.fem.field import read_meshio
 
 # %%
-# What a solver would have left: nodes, cells, a vector at the nodes.
+# The file that a solver would have written: nodes, cells, and a displacement vector at each node.
 
 x, y = np.meshgrid(np.linspace(-10, 10, 61), np.linspace(-2, 2, 13))
 nodes = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
@@ -30,7 +30,7 @@ u = np.column_stack([u, 0 * u[:, 0]])
 meshio.Mesh(nodes, {"quad": cells}, point_data={"U": u}).write(beam)
 
 # %%
-# From the file to images with their truth.
+# The file is read, and images with a known true displacement are made.
 
 solution = read_meshio(beam, displacement="U", nominal_strain=0.1)
 images = mh.make_images(solution, mh.ImagingSpec(pixel_size=0.03), beam.parent / "images")

@@ -2,8 +2,8 @@
 Which camera does a test need?
 ==============================
 
-Before anything is cut or photographed: the standard deviation of the amplitude v₁ that noise will
-leave, over pixel size and read noise, from the Cramér–Rao bound. No image is made.
+The standard deviation of the amplitude v₁ due to noise, over pixel size and read noise, can be
+predicted by the Cramér–Rao bound before a specimen is cut or photographed. No image is made.
 """
 
 import matplotlib.pyplot as plt

@@ -2,8 +2,8 @@
 What makes an infinite lattice buckle first
 ===========================================
 
-Of all Bloch waves, the first that costs no energy: its critical strain, and its mode. This example
-needs dolfinx.
+A lattice buckles in the Bloch wave whose energy vanishes first. The critical strain and the mode
+are computed here. This example needs dolfinx.
 """
 
 import matplotlib.pyplot as plt
@@ -22,7 +22,7 @@ print(critical.outcome)
 print(f"at {100 * critical.load:.2f} %, phases over π:", np.divide(critical.waves, np.pi).round(3))
 
 # %%
-# The mode on the smallest cell that repeats it, 2 x 2 holes, enlarged; colours are its length.
+# The mode, enlarged, on the smallest cell that has its period, 2 x 2 holes. Colours: its length.
 
 modes = real_modes(cell, critical.state, critical.waves)
 count = len(modes.waves)

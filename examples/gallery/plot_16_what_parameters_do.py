@@ -2,9 +2,9 @@
 What identifies a material
 ==========================
 
-An identification looks for parameters by what they do to displacements and force. Here: by how much
-one per cent more of a constant, or a tilt of the loaded edge by 0.1 mrad, moves a buckled specimen
-of 4 x 4 holes. This example needs dolfinx.
+An identification finds parameters by their effect on displacements and force. This example shows
+how a buckled specimen of 4 x 4 holes changes if a material constant is one per cent larger, or if
+the loaded edge is tilted by 0.1 mrad. It needs dolfinx.
 """
 
 import matplotlib.pyplot as plt
@@ -26,9 +26,9 @@ for name, step, by in zip(names, steps, after.force_by, strict=True):
     print(f"{name:13s} the force by {100 * step * by / after.force:+.2f} %")
 
 # %%
-# The modulus alone scales forces and leaves displacements as they are, as far as it grows with the
-# other stiffness, κ: without a load cell only their ratio is found. The exponent and the tilt move
-# the pattern.
+# If the modulus and the other stiffness, κ, increase by the same factor, forces increase by it and
+# displacements don't change: without a load cell, only their ratio can be found. The exponent and
+# the tilt change the pattern.
 
 corners = after.mesh.cells[:, :3]
 fig, axes = plt.subplots(1, 4, figsize=(11, 3.6), layout="constrained")

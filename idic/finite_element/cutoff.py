@@ -34,6 +34,7 @@ that are rougher than the displacement for which the cut-off wavelength was foun
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -90,25 +91,38 @@ def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> 
 def least_risk(
     at: Linearised, first_px: float, pixel_size: float, excess: float
 ) -> tuple[Risk, ...]:
-    """Try cut-offs from ``first_px`` until the risk rises on both sides; in ascending order."""
-    tried = {0: risk(at, first_px, pixel_size, excess)}
-    while True:
-        best = min(tried, key=lambda k: tried[k].value)
-        missing = [k for k in (best - 1, best + 1) if k not in tried]
-        if not missing or not 1.05 * _LEAST_PX < tried[best].cutoff_px < _MOST_PX:
-            return tuple(tried[k] for k in sorted(tried))
-        cutoff = max(first_px * _STEP ** missing[0], _LEAST_PX)
-        tried[missing[0]] = risk(at, cutoff, pixel_size, excess)
+    """Try cut-offs around ``first_px`` until the risk rises on both sides, or a bound is reached.
+
+    Returns three or more in ascending order.
+    """
+
+    def tried_at(cutoff_px: float) -> Risk:
+        return risk(at, float(np.clip(cutoff_px, _LEAST_PX, _MOST_PX)), pixel_size, excess)
+
+    first_px = np.clip(first_px, _STEP * _LEAST_PX, _MOST_PX / _STEP)
+    tried = [tried_at(first_px * ratio) for ratio in (1.0 / _STEP, 1.0, _STEP)]
+    while _lowest(tried) == 0 and tried[0].cutoff_px > 1.05 * _LEAST_PX:
+        tried.insert(0, tried_at(tried[0].cutoff_px / _STEP))
+    while _lowest(tried) == len(tried) - 1 and tried[-1].cutoff_px < _MOST_PX:
+        tried.append(tried_at(tried[-1].cutoff_px * _STEP))
+    return tuple(tried)
 
 
-def best_of(tried: tuple[Risk, ...]) -> float:
-    """Cut-off wavelength at the vertex of the parabola through the three lowest risks [px]."""
-    k = min(range(len(tried)), key=lambda i: tried[i].value)
-    if not 0 < k < len(tried) - 1:
-        return max(tried[k].cutoff_px, _LEAST_PX)
-    three = tried[k - 1 : k + 2]
-    a, b, _ = np.polyfit(np.log([t.cutoff_px for t in three]), [t.value for t in three], 2)
-    return max(float(np.exp(-0.5 * b / a)), _LEAST_PX)
+def best_of(tried: Sequence[Risk]) -> float:
+    """Cut-off wavelength at the vertex of the parabola through the lowest risk and neighbours [px].
+
+    ``tried`` are three or more. The vertex is kept within the bounds of the search.
+    """
+    k = _lowest(tried)
+    first = min(max(k - 1, 0), len(tried) - 3)
+    x, y = np.transpose([(np.log(t.cutoff_px), t.value) for t in tried[first : first + 3]])
+    a, b, _ = np.polyfit(x, y, 2)
+    vertex = -0.5 * b / a if a > 0.0 else np.log(tried[k].cutoff_px)
+    return float(np.exp(np.clip(vertex, np.log(_LEAST_PX), np.log(_MOST_PX))))
+
+
+def _lowest(tried: Sequence[Risk]) -> int:
+    return int(np.argmin([one.value for one in tried]))
 
 
 class Deviations(NamedTuple):

@@ -15,6 +15,13 @@ import numpy as np
 
 from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.materials import Material
+from modeharvest.idic.finite_element.continued import (
+    NONE_CONTINUED,
+    ContinuedPixels,
+    continued_pixels,
+    continued_spline,
+    images_on,
+)
 from modeharvest.idic.finite_element.cutoff import (
     Deviations,
     Risk,
@@ -27,15 +34,8 @@ from modeharvest.idic.finite_element.cutoff import (
 )
 from modeharvest.idic.finite_element.fields import determinant, element_gradients
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
-from modeharvest.idic.finite_element.pixels import (
-    NONE_CONTINUED,
-    ContinuedPixels,
-    ElementPixels,
-    continued_pixels,
-    continued_spline,
-    images_on,
-    normal_equations,
-)
+from modeharvest.idic.finite_element.normal_equations import normal_equations
+from modeharvest.idic.finite_element.pixels import ElementPixels
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body, Imbalance, Linearised, Smoothness
 from modeharvest.idic.result import Result

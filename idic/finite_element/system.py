@@ -34,7 +34,8 @@ from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.idic.finite_element.fields import mean_around
-from modeharvest.idic.finite_element.pixels import MeshPixels, NodalEquations
+from modeharvest.idic.finite_element.normal_equations import NodalEquations
+from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.free_edges import FreeEdges, on_sides
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled

@@ -27,7 +27,7 @@ from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import Slow, first_motion
-from modeharvest.idic.photograph.matching import (
+from modeharvest.idic.photograph.matching.blocks import (
     BLOCKS,
     REACH_PX,
     BlockMatch,

@@ -30,12 +30,12 @@ from modeharvest.idic.photograph.initial_guess import (
     initial_guess,
     shows_more,
 )
-from modeharvest.idic.photograph.matching import (
+from modeharvest.idic.photograph.matching.blocks import (
     expected_by,
     match_blocks,
-    matched_holes,
     require_same_surface,
 )
+from modeharvest.idic.photograph.matching.holes import matched_holes
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.solver.final_smoothing import speckle_size

@@ -23,12 +23,12 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import refitted
 from modeharvest.idic.finite_element.system import SAMPLES, Body
 from modeharvest.idic.photograph.geometry import box_of
-from modeharvest.idic.photograph.plain import (
+from modeharvest.idic.photograph.plain.measure import displacement_between
+from modeharvest.idic.photograph.plain.surface import (
     CUT,
     MaterialContours,
     away_from_cuts,
     contours_around,
-    displacement_between,
 )
 from modeharvest.idic.result import Covariance, Result
 from modeharvest.imaging.grid import PixelGrid

@@ -1,4 +1,4 @@
-"""Commands of a benchmark for any DIC code: make its images, grade what comes back."""
+"""Commands of a benchmark for any DIC code: make its images, grade the measured fields."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def make(
     ] = None,
     solution: SolutionFile = None,
 ) -> None:
-    """Make a public set of images, and apart from it the truth to score fields with.
+    """Make a public set of images, and in a separate folder the truth for grading fields.
 
     The public folder holds reference.tif, deformed_*.tif, mask.tif, benchmark.json and README.md,
-    and nothing that gives the displacements away.
+    and nothing that reveals the displacements.
     """
     from modeharvest.runs.case import Case
 
@@ -79,7 +79,7 @@ def score(
     """Grade displacement fields of any DIC code against the truth of a benchmark, and rank them.
 
     --unit, --y-axis and --first-pixel apply to all fields, or are given once for each, in order.
-    Leaves report.html, scores.json and scores.csv in DIR. Fields that can't be graded are named at
+    Writes report.html, scores.json and scores.csv to DIR. Fields that can't be graded are named at
     the end, and the exit code is then 2.
     """
     from modeharvest.report.grades import grading_report
@@ -96,7 +96,7 @@ def score(
 
 
 def _refuse(reasons: Mapping[str, str]) -> None:
-    """Name the fields that were not graded; the exit code is then 2."""
+    """Print why fields were not graded, and exit with code 2 if there are any."""
     for why in reasons.values():
         report_error(InputError(why))
     if reasons:
@@ -116,8 +116,8 @@ def star(
 ) -> None:
     """Make the star images of DIC Challenge 2.0: a wave whose period grows along the image.
 
-    Writes exact images, and for each level of noise three as a camera's: reference, a second one
-    without motion, deformed. The displacement is a formula, in README.md and star.json.
+    Writes exact images, and for each noise level three camera images: the reference, a second one
+    without motion, and the deformed one. README.md and star.json give the displacement's formula.
     """
     from modeharvest.validation.scoring.star import Star, StarSpec, fine_speckle, make_star_set
 
@@ -149,7 +149,7 @@ def resolution(
     """Grade fields measured on the star: finest period, noise floor, metrological efficiency.
 
     Fields are in px. --y-axis and --first-pixel apply to all, or are given once for each FIELD
-    and its --still. Leaves report.html, resolution.json and resolution.csv in DIR.
+    and its --still. Writes report.html, resolution.json and resolution.csv to DIR.
     """
     from modeharvest.report.grades import star_report
     from modeharvest.report.model import print_report

@@ -1,6 +1,6 @@
 """Commands that run a case: virtual experiments, infinite lattices, photographs, studies.
 
-What the commands need is imported where they need it, so that ``--help`` is quick.
+Commands import the modules they need when they are called, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def cases(
     name: Annotated[str | None, typer.Argument(help="Print this case's TOML file.")] = None,
 ) -> None:
-    """List the shipped cases and their commands, or print one as a start for your own.
+    """List the shipped cases and their commands, or print one to start your own from.
 
     For example: modeharvest cases paper-virtual > mine.toml
     """
@@ -47,11 +47,11 @@ WholeField = Annotated[
 def run(
     case: CaseName, out: OutFolder, solution: SolutionFile = None, whole_field: WholeField = None
 ) -> None:
-    """Run a whole case: simulate, image, correlate, validate.
+    """Run a virtual experiment: simulate, make images, correlate, validate.
 
-    Leaves solution, images with truth, results, report.html and summary.json in DIR. Run the
-    same command again after an interruption: finished stages are not repeated. The twin of a real
-    experiment is photographed, measured from its photographs alone, and compared with its truth.
+    Writes solution, images with truth, results, report.html and summary.json to DIR. After an
+    interruption run the same command again: finished stages are not repeated. A case with a table
+    "calibration" is the twin of a real experiment, and is measured from its photographs alone.
     """
     from modeharvest.report.experiment import experiment_report
     from modeharvest.report.model import print_report
@@ -71,8 +71,8 @@ def run(
 def fem(case: CaseName, out: OutFolder) -> None:
     """Simulate the compression test (needs dolfinx): DIR/solution.h5 and .vtu.
 
-    Finds the critical strain, proves stability by the tangent's inertia, follows the buckled
-    branch. Under mpirun it runs in parallel.
+    Finds the critical strain, proves stability by the inertia of the tangent stiffness, and
+    follows the buckled branch. Runs in parallel under mpirun.
     """
     from modeharvest.report.experiment import critical_line
 
@@ -106,7 +106,7 @@ def correlate(case: CaseName, out: OutFolder, whole_field: WholeField = None) ->
     with _stages(case, out, whole_field=whole_field) as stages:
         stages.correlate()
         wholes = stages.measure()
-        results = stages.correlate()  # some of them may come from what was measured
+        results = stages.correlate()  # failed ones are repeated from the measured displacement
     for strain, result in results.items():
         print(f"{100 * strain:6.2f} %  {result.outcome.name.lower()}: {result.outcome.value}")
     for strain, whole in wholes.items():
@@ -117,7 +117,7 @@ def correlate(case: CaseName, out: OutFolder, whole_field: WholeField = None) ->
 def validate(
     case: CaseName, out: OutFolder, solution: SolutionFile = None, whole_field: WholeField = None
 ) -> None:
-    """Compare what was measured with the truth: DIR/report.html and DIR/summary.json."""
+    """Compare the measurement with the truth: DIR/report.html and DIR/summary.json."""
     from modeharvest.report.experiment import experiment_report
     from modeharvest.report.model import print_report
 
@@ -130,7 +130,7 @@ def validate(
 def _stages(
     case: str, out: Path, solution: Path | None = None, whole_field: bool | None = None
 ) -> Iterator[Run]:
-    """The stages of a case, under progress bars; ``whole_field`` instead of what the case says."""
+    """Stages of a case, with progress bars; ``whole_field`` overrides the case if not None."""
     from modeharvest.runs.case import Case
 
     checked = Case.read(case)
@@ -146,9 +146,9 @@ def _stages(
 def bloch(case: CaseName, out: OutFolder) -> None:
     """Find the first instability of an infinite lattice, over all waves (needs dolfinx).
 
-    Square, hexagonal or chiral, or with kind = "file" a mesh or geometry of your own (see
-    docs/how-to/own_cell.md). Leaves the first critical load and waves with their proof, eigenvalues
-    against the wave vector (dispersion.csv, dispersion.h5), report.html and summary.json.
+    The lattice is square, hexagonal or chiral, or with kind = "file" your own mesh or geometry (see
+    docs/how-to/own_cell.md). Writes the first critical load and waves with their proof, eigenvalues
+    over the wave vector (dispersion.csv, dispersion.h5), report.html and summary.json.
     """
     _analyse(case, out, whole=False)
 
@@ -156,8 +156,8 @@ def bloch(case: CaseName, out: OutFolder) -> None:
 def modes(case: CaseName, out: OutFolder) -> None:
     """Find an infinite lattice's modes, buckled branches and mode families (needs dolfinx).
 
-    Does what 'bloch' does, unless its results exist, and then finds real modes on the smallest
-    cell, branches with their energies, spectra, and the Fourier mode families in the spectra.
+    Runs 'bloch' unless its results exist, and then finds real modes on the smallest periodic cell,
+    buckled branches with their energies, spectra, and the Fourier mode families in the spectra.
     """
     _analyse(case, out, whole=True)
 
@@ -210,16 +210,16 @@ def harvest(
         typer.Option(metavar="SECONDS", help="Stop watching when no photograph came for so long."),
     ] = None,
 ) -> None:
-    """Harvest modes from photographs of a test: v0, v1 and phi1 with error bars.
+    """Measure modes in photographs of a test: v0, v1 and phi1 with error bars.
 
     The TOML file names the reference and the deformed images, the pixel size and the cell size;
-    all else is found or has a default. Begin with 'modeharvest harvest --example >
-    experiment.toml'. Leaves results/, report.html and summary.json in DIR. Run the same command
-    again after an interruption: finished photographs are not measured again.
+    all else is detected or has a default. Begin with 'modeharvest harvest --example >
+    experiment.toml'. Writes results/, report.html and summary.json to DIR. After an interruption
+    run the same command again: finished photographs are not measured again.
 
-    With --watch, photographs are measured quickly as they come, and DIR/watch.html predicts when
-    the specimen will buckle; it ends with Ctrl-C, or by --until-still. Run the command again
-    without --watch to measure all photographs in full.
+    With --watch, photographs are measured quickly as they arrive, and DIR/watch.html predicts the
+    strain at which the specimen will buckle. Watching ends with Ctrl-C or by --until-still. Run
+    the command again without --watch to measure all photographs in full.
     """
     if watch is not None:
         return _watch(experiment, out, watch, until_still)
@@ -272,9 +272,9 @@ def measure(
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
-    TIFF, PNG or JPEG of one size, folders, videos; specimens without speckle, if they are in the
-    images as a whole, by contours. Leaves displacement, standard deviations, strains (HDF5, VTU,
-    CSV, TIFF), report.html, summary.json in DIR. Run again after an interruption: it continues.
+    Images: TIFF, PNG, JPEG of one size, folders, videos. Specimens without speckle are measured by
+    contours if they are fully visible. Writes displacement, standard deviations, strains (HDF5,
+    VTU, CSV, TIFF), report.html, summary.json to DIR. If interrupted, run it again: it continues.
 
     For example: modeharvest measure ref.tif def_*.tif --mask mask.png --out out/plate
     """
@@ -319,8 +319,8 @@ def study(
 ) -> None:
     """Study the accuracy of the measurement: many cases, run by several processes.
 
-    Leaves table.csv, report.html and summary.json in DIR. Run the same command again after an
-    interruption: finished cases are not repeated.
+    Writes table.csv, report.html and summary.json to DIR. After an interruption run the same
+    command again: finished cases are not repeated.
     """
     if scheduler is not None and workers is not None:
         raise InputError(

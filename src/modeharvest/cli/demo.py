@@ -1,4 +1,4 @@
-"""What a newcomer sees first: the command line's own words, and ``modeharvest demo``."""
+"""Introductory texts of the command line, and ``modeharvest demo``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from modeharvest.cli.messages import bars, folder_option
 
 CASE = "paper-virtual"
 PIXEL_SIZE = 0.02
-"""[mm/px]; twice the case's, so that images have a quarter of its pixels."""
+"""Pixel size [mm]: twice the case's, so that images have a quarter of its pixels."""
 
 ABOUT = (
     "A virtual laboratory for integrated digital image correlation (IDIC) on mechanical "
@@ -52,10 +52,10 @@ def demo(
         "modeharvest-demo"
     ),
 ) -> None:
-    """Image and measure a buckled specimen, and see the errors: no finite elements needed.
+    """Make and measure images of a buckled specimen, and see the errors; needs no dolfinx.
 
-    Takes the solution of the paper's specimen that comes with the package, and larger pixels than
-    the paper; leaves report.html in DIR. The first run compiles kernels, which are kept on disk.
+    Uses the solution of the paper's specimen that comes with the package, and larger pixels than
+    the paper; writes report.html to DIR. The first run compiles kernels, which are kept on disk.
     """
     from modeharvest.runs.case import Case, shipped_solution
     from modeharvest.runs.experiment import Run
@@ -66,7 +66,7 @@ def demo(
     case = case.model_copy(update={"title": title, "imaging": imaging})
     with bars() as progress:
         summary = Run(case, out, progress, shipped_solution(CASE)).all()
-    # Loaded by the run while kernels compile.
+    # The run has loaded these modules while kernels were compiled.
     from modeharvest.report.experiment import experiment_report
     from modeharvest.report.model import print_report
 

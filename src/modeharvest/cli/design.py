@@ -1,4 +1,4 @@
-"""The command that designs a test before anything is cut or photographed."""
+"""The command that predicts the errors of a test before it is made."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from modeharvest.cli.messages import CaseName, OutFolder, SolutionFile, bars
 
 
 def design(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
-    """Predict how well a test will measure v1, wave numbers and phases, before it is made.
+    """Predict the errors of v1, wave numbers and phases in a test before it is made.
 
-    By the Cramér–Rao bound, without an image: standard deviations by the camera's noise; which
-    pixel size, speckle, noise, exposures and light a wanted error needs; how degrees and strains
-    change it. Leaves report.html with tables and a map, and summary.json. CASE is a virtual
-    experiment; its table "design" states the wanted errors (docs/how-to/design.md).
+    Uses the Cramér–Rao bound and no images. Finds standard deviations by camera noise, the pixel
+    size, speckle, noise, exposures and light for wanted errors, and the effect of polynomial
+    degrees and strain. Writes report.html with tables and a map, and summary.json. CASE is a
+    virtual experiment; its table "design" states the wanted errors (docs/how-to/design.md).
     """
     from modeharvest.report.design import design_report
     from modeharvest.report.model import print_report

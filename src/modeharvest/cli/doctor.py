@@ -1,4 +1,4 @@
-"""``modeharvest doctor``: what is there, what is missing, where caches lie."""
+"""``modeharvest doctor``: installed and missing libraries, and the locations of caches."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ OPTIONAL = {
     "gmsh": "meshes: pip install gmsh; beside dolfinx: conda, or apt install python3-gmsh",
     "imageio-ffmpeg": "videos: pip install imageio-ffmpeg",
 }
-"""Libraries that only some commands need, and how to get them."""
+"""Libraries that only some commands need, and how to install them."""
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "demo": (), "doctor": (), "cases": (), "image": (), "correlate": (), "validate": (),
     "share": (), "harvest": (), "design": (), "study": (), "score": (), "benchmark": (), "run": (),
     "measure": ("gmsh",), "fem": FEM, "bloch": FEM, "modes": FEM,
     "homogenize": FEM, "identify": FEM, "gauges": (), "animate": (), "export": (),
 }  # fmt: skip
-"""What each command needs beyond the package's own dependencies."""
+"""Libraries that each command needs beyond the package's dependencies."""
 REMARKS = {
     "run": "for a specimen without a solution: fenics-dolfinx; with --whole-field: gmsh",
     "harvest": "with --whole-field: gmsh; for videos: imageio-ffmpeg",
@@ -48,18 +48,18 @@ class Diagnosis:
 
 
 def found_version(name: str) -> str:
-    """Of a library; "" if it isn't there."""
+    """Version of a library, "there" if it has none; "" if the library is missing."""
     from importlib.util import find_spec
 
     try:
         return version(name)
-    except PackageNotFoundError:  # Debian's gmsh tells none
+    except PackageNotFoundError:  # Debian's gmsh has no version
         module = name.replace("-", "_").removeprefix("fenics_")
         return "there" if find_spec(module) is not None else ""
 
 
 def examine() -> Diagnosis:
-    """Look at this machine and installation."""
+    """Collect what is known about this machine and installation."""
     from modeharvest.util import __version__
     from modeharvest.util.machine import available_bytes
 
@@ -90,7 +90,7 @@ def _required() -> list[str]:
 
 
 def caches() -> Iterator[Row]:
-    """Where something is kept between runs: what, where, how large it is and how to remove it."""
+    """Rows about caches that are kept between runs: content, folder, and how to remove it."""
     from modeharvest.imaging.mapping.rasterise import rasterise
     from modeharvest.runs.precompile import stamps
     from modeharvest.util.compiled import cached_in, is_cached
@@ -116,7 +116,7 @@ def caches() -> Iterator[Row]:
 
 
 def doctor() -> None:
-    """Check the installation: libraries, what each command needs, where caches are."""
+    """Check the installation: libraries, needs of each command, locations of caches."""
     found = examine()
     for title, rows in (("This machine", found.machine), ("Libraries", found.libraries),
                         ("Commands", found.commands), ("Caches", found.caches)):  # fmt: skip

@@ -1,4 +1,4 @@
-"""Commands for fields that are measured already: exported, read by gauges, animated."""
+"""Commands for measured fields: export, gauges, animation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def export(
 ) -> None:
     """Write measured displacements in another DIC code's format, or with all derived fields.
 
-    Other codes' fields are recognised and converted; how they were read is printed.
+    Other codes' fields are recognised and converted; the conventions found are printed.
     """
     from modeharvest.idic.local.export import export_field
     from modeharvest.idic.local.field import read_field

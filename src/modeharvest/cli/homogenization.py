@@ -1,4 +1,4 @@
-"""The command that puts modes to use: a specimen homogenized with them."""
+"""The command that homogenizes a specimen with modes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from modeharvest.cli.messages import CaseName, OutFolder, bars
 def homogenize(case: CaseName, out: OutFolder) -> None:
     """Homogenize a specimen with modes, measured or computed (needs dolfinx).
 
-    Micromorphic homogenization: finite elements of u and the modes' amplitudes v, with an RVE at
-    each quadrature point. Leaves the critical strain, forces and energies with the standard
-    deviations due to a measured mode's error bars, beside a direct simulation of all holes:
-    report.html, summary.json, homogenized.h5; and the RVE with its modes and moduli for other
-    codes: rve.h5, rve.mat. The mode of 'paper-homogenized' is measured in the images of the
+    Micromorphic homogenization: finite elements for u and the modes' amplitudes v, with an RVE at
+    each quadrature point. Writes the critical strain, forces and energies, with standard deviations
+    due to a measured mode's error bars, and a comparison with a direct simulation of all holes
+    (report.html, summary.json, homogenized.h5), and the RVE with its modes and moduli for other
+    codes (rve.h5, rve.mat). The mode of 'paper-homogenized' is measured in the images of the
     paper's virtual experiment, which is run in DIR/experiment.
     """
     from modeharvest.report.homogenization import homogenization_report

@@ -22,9 +22,9 @@ def identify(
     """Identify material, supports and holes of a test from images and forces (needs dolfinx).
 
     Integrated digital image correlation with a finite-element model's parameters as unknowns; the
-    images may be replaced by a displacement field of any code. Leaves the parameters with standard
-    deviations and correlations, the model's states, report.html and summary.json in DIR. Begin
-    with 'modeharvest cases identify-twin > experiment.toml', which makes its own data.
+    images may be replaced by a displacement field of any code. Writes the parameters with standard
+    deviations and correlations, the model's states, report.html and summary.json to DIR. Begin
+    with 'modeharvest cases identify-twin > experiment.toml', a case that simulates its own data.
     """
     from modeharvest.report.identification import identification_report
     from modeharvest.report.model import print_report

@@ -1,4 +1,4 @@
-"""What commands share: arguments; progress bars, warnings and errors on stderr; exit codes."""
+"""Common parts of commands: arguments; progress bars, warnings, errors on stderr; exit codes."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ CaseName = Annotated[
 
 
 def _folder(text: str | None) -> Path | None:
-    """What stands for a folder that will be written to; InputError if it can't be one."""
+    """Path of a folder that will be written to; InputError if it can't be a folder."""
     if text is None:
         return None
     if not text:
         raise InputError("expected a folder, got an empty name; '.' is the current one")
-    from modeharvest.util.files import require_no_file  # here, so that --help is quick
+    from modeharvest.util.files import require_no_file  # here, so that --help is fast
 
     require_no_file(Path(text))
     return Path(text)
 
 
 def folder_option(name: str, about: str) -> Any:
-    """An option that names a folder to write to, checked before any work begins."""
+    """Make an option that names a folder to write to, which is checked before any work begins."""
     return typer.Option(name, help=about, metavar="DIR", parser=str, callback=_folder)
 
 
@@ -61,7 +61,7 @@ class ProgressBars(RichProgress):
 
     def __init__(self, console: Console) -> None:
         super().__init__(
-            TextColumn("{task.description:<28}", markup=False),  # it may name a user's file
+            TextColumn("{task.description:<28}", markup=False),  # may contain a file's name
             BarColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
@@ -69,10 +69,10 @@ class ProgressBars(RichProgress):
             console=console,
         )
         self._steps: dict[str, TaskID] = {}
-        self.disable = True  # until the first step: an empty line would be drawn
+        self.disable = True  # until the first step, or an empty line would be drawn
 
     def __call__(self, done: float, total: float, what: str) -> None:
-        """Draw the step ``what``; a step that begins finishes the one before."""
+        """Show the progress of the step ``what``; a new step completes those before it."""
         if what not in self._steps:
             self.disable = False
             self.start()
@@ -84,8 +84,8 @@ class ProgressBars(RichProgress):
 
 @contextmanager
 def compilation_announced(console: Console) -> Iterator[None]:
-    """Say once, in one line, when a kernel has to be compiled because none is in the cache yet."""
-    from numba.core import event  # here: --help needn't wait for it
+    """Print one line when the first kernel is compiled that is not in the cache."""
+    from numba.core import event  # here, so that --help is fast
 
     from modeharvest.util.compiled import is_cached
 
@@ -101,7 +101,7 @@ def compilation_announced(console: Console) -> Iterator[None]:
         def on_end(self, event: Any) -> None:
             pass
 
-    compiler: Any = event  # which has no types
+    compiler: Any = event  # has no type hints
     with compiler.install_listener("numba:compile", Notice()):
         yield
 
@@ -109,31 +109,31 @@ def compilation_announced(console: Console) -> Iterator[None]:
 console = Console(stderr=True)
 
 UNUSABLE, FAULT, INTERRUPTED, UNREAD = 2, 70, 130, 1
-"""Exit codes: of input or an environment that can't be used; of a fault in the program (EX_SOFTWARE
-of sysexits.h); after Ctrl-C; where nobody reads what is printed (as in ``| head``)."""
+"""Exit codes: unusable input or environment; a fault in the program (EX_SOFTWARE of sysexits.h);
+Ctrl-C; a closed pipe that can't take the output (as in ``| head``)."""
 
 was_interrupted = False
-"""Set by Ctrl-C, whose exception can get lost: Python drops it in destructors and callbacks, numba
-while it looks for a kernel, and PETSc makes another one of it."""
+"""Set by Ctrl-C, because its exception can get lost: Python drops it in destructors and callbacks,
+numba while it searches for a kernel, and PETSc replaces it by another exception."""
 
 
 UsageError: type[Any] = typer.BadParameter.__bases__[0]
-"""click's, which newer versions of typer carry within themselves."""
+"""Click's class of usage errors, of which newer versions of typer contain a copy."""
 
 
 class InterruptionError(Exception):
-    """Ctrl-C, under a name that the command-line library does not take for its own."""
+    """Replaces the KeyboardInterrupt of Ctrl-C, which typer would handle itself."""
 
 
 def end_if_interrupted() -> None:
-    """Raise KeyboardInterrupt if there was one that got lost."""
+    """Raise KeyboardInterrupt if Ctrl-C was pressed, in case its exception got lost."""
     if was_interrupted:
         raise KeyboardInterrupt
 
 
 @contextmanager
 def bars() -> Iterator[Progress]:
-    """Progress bars for the work of a ``with`` block, which ends at the next step after Ctrl-C."""
+    """Show progress bars in a ``with`` block; after Ctrl-C the next step ends the block."""
     with ProgressBars(console) as drawn, compilation_announced(console):
 
         def listener(done: float, total: float, what: str) -> None:
@@ -144,14 +144,14 @@ def bars() -> Iterator[Progress]:
 
 
 def warn(message: str) -> None:
-    """Print a warning."""
+    """Print a warning to stderr."""
     console.print(f"[yellow]warning:[/yellow] {escape(message)}", highlight=False)
 
 
 def report_error(error: BaseException) -> int:
-    """Say in one line why a command ended early; returns the exit code.
+    """Print in one line why a command ended early; returns the exit code.
 
-    Nothing leads to a traceback on the terminal: what nobody thought of goes to a file.
+    Tracebacks are not printed: those of unexpected errors are written to a file.
     """
     if isinstance(error, BrokenPipeError):
         return UNREAD
@@ -170,12 +170,12 @@ _FORESEEN = (
 
 
 def _print(line: str) -> None:
-    with suppress(OSError):  # stderr may be full or closed, too
+    with suppress(OSError):  # stderr may be full or closed
         console.print(line, highlight=False, soft_wrap=True)
 
 
 def _line(error: BaseException) -> str:
-    """An error in one line; empty where all was printed already."""
+    """An error in one line; empty if everything was printed already."""
     if isinstance(error, UsageError):
         return _usage(error)
     if isinstance(error, (InputError, MissingDependencyError)):
@@ -192,14 +192,14 @@ def _line(error: BaseException) -> str:
 
 
 def _usage(error: Any) -> str:
-    """A command line that can't be understood; empty where none was given: the help is printed."""
+    """A usage error in one line; empty if no command was given, because help is printed then."""
     what, where = " ".join(error.format_message().split()), error.ctx.command_path
     if (param := getattr(error, "param", None)) is not None:
         option = param.opts[0] if param.param_type_name == "option" else ""
         if not error.message:
             name = " ".join(filter(None, (param.param_type_name, option, param.metavar)))
             what = f"missing {name}: {param.help}"
-        elif hasattr(error.__cause__, "errors"):  # pydantic's
+        elif hasattr(error.__cause__, "errors"):  # of pydantic
             first = error.__cause__.errors()[0]
             expected = first["msg"].partition(",")[0].replace("Input should be", "expected")
             what = f"{option or param.metavar}: {expected}, got {first['input']!r}"
@@ -210,7 +210,7 @@ def _usage(error: Any) -> str:
 
 
 def _log(error: BaseException) -> str:
-    """Write an error's traceback to a new file; returns its name."""
+    """Write an error's traceback to a new file; returns its name, or if this fails, the text."""
     text = f"{' '.join(map(repr, sys.argv))}\n{sys.version}\n\n"
     text += "".join(traceback.format_exception(error))
     try:

@@ -1,4 +1,4 @@
-"""The root of the command line: its commands, and the net under them that catches all errors."""
+"""The root of the command line: registers all commands, and handles all their errors."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
 
 
 class _Command(TyperCommand):
-    """A command whose interruptions and errors the command-line library leaves to us."""
+    """A command whose interruptions and errors are handled here instead of by typer."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:
             return super().parse_args(ctx, args)
         except messages.UsageError as error:
-            error.ctx = ctx  # an option without its value doesn't know
+            error.ctx = ctx  # not set if an option lacks its value
             raise
 
     def invoke(self, ctx: Any) -> None:
@@ -70,7 +70,7 @@ class _Command(TyperCommand):
 
 
 def _help(command: Callable[..., None]) -> str:
-    """Of a command, without the source's line breaks, which the library would keep."""
+    """Help text of a command without the source's line breaks, which typer would keep."""
     paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
     return "\n\n".join(" ".join(text.split()) for text in paragraphs)
 
@@ -106,7 +106,7 @@ def main() -> None:
     with _interruptions_remembered():
         if is_first():
             _run()
-        else:  # under mpirun one speaks for all
+        else:  # under mpirun only rank 0 prints
             messages.console.quiet = True
             with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
                 _run()
@@ -117,7 +117,7 @@ def _run() -> None:
         try:
             sys.exit(app(prog_name="modeharvest", standalone_mode=False) or 0)
         finally:
-            sys.stdout.flush()  # a full disk shows now or never
+            sys.stdout.flush()  # raises an error now if the disk is full
     except SystemExit:
         raise
     except BaseException as error:
@@ -126,9 +126,9 @@ def _run() -> None:
 
 
 def _open_streams() -> None:
-    """Have all three streams, whatever the caller has closed, and no character they can't print.
+    """Open standard streams that the caller has closed; escape characters they can't encode.
 
-    A closed one's number would go to the next file opened, and what libraries print into that.
+    Otherwise the next file opened would get a closed stream's number, and libraries' output.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         pass
@@ -141,7 +141,7 @@ def _open_streams() -> None:
 
 
 def _drop_output() -> None:
-    """Have what is left to be printed to a full or closed stdout not fail once more at exit."""
+    """Discard output that a full or closed stdout can't take, as it would fail again at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -150,7 +150,7 @@ def _drop_output() -> None:
 
 @contextmanager
 def _interruptions_remembered() -> Iterator[None]:
-    """Note Ctrl-C, unless the caller has it ignored, as shells do in the background."""
+    """Record Ctrl-C, unless the caller ignores it, as shells do for background processes."""
     messages.was_interrupted = False
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
@@ -166,12 +166,12 @@ def _interruptions_remembered() -> Iterator[None]:
 
 
 def _interrupt(number: int, frame: object) -> NoReturn:
-    """Ctrl-C, whatever becomes of the exception: see ``messages.end_if_interrupted``."""
+    """Record Ctrl-C and raise its exception, which may get lost: see ``end_if_interrupted``."""
     messages.was_interrupted = True
     raise KeyboardInterrupt
 
 
 def _unless_interrupted(ignored: UnraisableHookArgs) -> None:
-    """Print nothing of an interruption in a destructor or a callback: it isn't lost."""
+    """Print errors of destructors and callbacks, except for Ctrl-C, which was recorded."""
     if not issubclass(ignored.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(ignored)

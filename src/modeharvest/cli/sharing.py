@@ -24,7 +24,7 @@ def share(
 ) -> None:
     """Describe a finished folder for an archive: RO-Crate with licence, checksums, software, units.
 
-    Leaves ro-crate-metadata.json there. 'modeharvest benchmark verify' checks it afterwards.
+    Writes ro-crate-metadata.json to FOLDER. 'modeharvest benchmark verify' checks it afterwards.
     """
     from modeharvest.runs.benchmark.crate import METADATA, write_crate
 
@@ -34,7 +34,7 @@ def share(
 
 
 def verify(folder: Folder) -> None:
-    """Check a shared folder: all files listed and unchanged, a set's id that of its images."""
+    """Check a shared folder: all files are listed and unchanged, a set's id fits its images."""
     from modeharvest.runs.benchmark.crate import verify as faults_of
 
     faults = faults_of(folder)
@@ -54,7 +54,7 @@ def standard(
         int, typer.Option("--seed", min=0, help="0: the open set; a large one: a blind set.")
     ] = 0,
 ) -> None:
-    """Make the standard set: twelve cases of specimen, d/l, noise, speckle, resolution, lens."""
+    """Make the standard set: twelve cases that vary specimen, d/l, noise, speckle, pixels, lens."""
     from modeharvest.runs.benchmark.standard import make_standard
 
     with bars() as progress:

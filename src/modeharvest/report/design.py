@@ -1,4 +1,4 @@
-"""Report of a test's design: errors to expect, what is needed for the wanted ones, and a map."""
+"""Report of a test's design: expected errors, settings needed for wanted errors, and a map."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from modeharvest.validation.design import DesignRanges, ExpectedErrors
 Summary = Mapping[str, Any]
 _ERRORS, _AXES = headings(ExpectedErrors), headings(DesignRanges)
 _WITHIN = 0.5
-"""Model error that is this share of what noise makes would hardly show beside it."""
+"""Model error over the standard deviation of u by noise, above which a warning is given [-]."""
 
 
 def design_report(summary: Summary) -> Report:
-    """The report of a design; ``summary``: the content of ``summary.json``."""
+    """Make the report of a design; ``summary``: content of ``summary.json``."""
     sought = summary["parameters"]
     shown_errors = {k: v for k, v in _ERRORS.items() if sought or k != "parameter_percent"}
     varied = [
@@ -73,7 +73,7 @@ def design_report(summary: Summary) -> Report:
 
 
 def findings(summary: Summary) -> list[str]:
-    """What is to be expected, in sentences."""
+    """Expected errors in sentences, and whether they are within the wanted ones."""
     expected, wanted = summary["expected"], summary["wanted"]
     text = [text_of("design-expected", **expected, setup=summary["setup"])]
     if names := summary["parameters"]:
@@ -93,7 +93,7 @@ def findings(summary: Summary) -> list[str]:
 
 
 def _needed(summary: Summary) -> ReportTable:
-    """What each wanted error needs of each thing, and what the case has."""
+    """Table of the limit of each quantity for each wanted error, and of its value in the case."""
     wanted, setup, varied = summary["wanted"], summary["setup"], summary["varied"]
     rows = []
     for axis, values in summary["needed"].items():
@@ -114,7 +114,7 @@ def _needed(summary: Summary) -> ReportTable:
 
 
 def _draw_map(shown: Mapping[str, Any], wanted: float, labels: list[str]) -> Figure:
-    """Draw the map with a line where the error is as wanted, if it is anywhere."""
+    """Draw a map of the error, with a contour line at the wanted error if it occurs."""
     drawn, axes = curve(labels[0], labels[1], (6.4, 3.6))
     at, errors = (shown["first"], shown["second"]), np.array(shown["errors"])
     looks: dict[str, Any] = {"norm": LogNorm(), "cmap": SIZE, "shading": "gouraud"}

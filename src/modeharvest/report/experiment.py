@@ -1,4 +1,4 @@
-"""Report of a virtual experiment: every panel of the paper's figures for every snapshot, tables."""
+"""Report of a virtual experiment: the panels of the paper's figures for each snapshot, tables."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _MODE = tuple(zip([f"a{i}" for i in "₁₂₃₄₅₆₇"], ("-",) * 5 + ("mm"
 
 @dataclass(frozen=True, eq=False)
 class ExperimentData:
-    """What the figures of a virtual experiment are drawn from, snapshots by ascending strain."""
+    """Data of the figures of a virtual experiment; snapshots are in order of ascending strain."""
 
     solution: Solution
     images: ImageSet
@@ -61,17 +61,17 @@ class ExperimentData:
     """Nominal strain of each snapshot [-]."""
     results: Sequence[Result]
     comparisons: Sequence[Comparison]
-    """Of each with the truth; may still be computed."""
+    """Comparison of each result with the truth; access may wait until it has been computed."""
     spectra: Sequence[tuple[Spectrum, WavePattern]]
-    """Of each its spectral densities and what is read off them; may still be computed."""
+    """Spectral densities of each, and the pattern found in them; access may wait, too."""
     pitch: float
     """Unit cell size l [mm]."""
     wholes: Sequence[tuple[WholeField, WholeFieldSummary]] = ()
-    """Of each the whole displacement and its errors, if measured; may still be computed."""
+    """Whole displacement of each and its errors, if measured; access may wait, too."""
 
     @cached_property
     def states(self) -> list[SnapshotState]:
-        """All snapshots."""
+        """The states to draw, one for each snapshot."""
         boundary, images = MeshBoundary.of(self.solution.mesh), self.images
         view = fits.SpecimenView(boundary, images.grid, images.mask(), self.pitch)
         return [
@@ -82,7 +82,7 @@ class ExperimentData:
 
     @property
     def modes(self) -> int:
-        """How many modes every snapshot has."""
+        """Number of modes that all snapshots have."""
         return min(len(result.ansatz.modes) for result in self.results)
 
     def _label(self, strain: float) -> str:
@@ -100,19 +100,19 @@ class ExperimentData:
 
 @dataclass(frozen=True, eq=False)
 class SnapshotState(fits.FittedState):
-    """A snapshot: number ``k`` of ``data``."""
+    """Snapshot number ``k`` (from 0) of ``data``."""
 
     data: ExperimentData
     k: int
 
     @property
     def comparison(self) -> Comparison:
-        """With the truth."""
+        """Comparison of the snapshot with the truth."""
         return self.data.comparisons[self.k]
 
 
 def snapshot_label(strain: float, branch: str, critical: float | None) -> str:
-    """What a snapshot is called on the page; strains [-], None without a critical one."""
+    """A snapshot's name on the page. Strains [-]; ``critical`` is None if there is none."""
     if branch != "primary":
         state = "After buckling"
     elif critical is None:
@@ -123,7 +123,7 @@ def snapshot_label(strain: float, branch: str, critical: float | None) -> str:
 
 
 def draw_hero(state: SnapshotState) -> Figure:
-    """The deformed image turning into the pattern that was measured in it."""
+    """Blend of the deformed image, from left to right, with the measured pattern (no modes: w)."""
     images, strain = state.data.images, state.data.strains[state.k]
     map_frame = state.view.map_frame()
     if fits.has_mode(0)(state):
@@ -149,7 +149,7 @@ def _residual(state: SnapshotState) -> Figure:
 
 
 def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
-    """The length of one of the comparison's vector fields."""
+    """A function that draws the length of one of the comparison's vector fields."""
 
     def draw(state: SnapshotState) -> Figure:
         length = lengths(getattr(state.comparison, name))
@@ -165,8 +165,8 @@ _WHOLE_MAPS: WholeMaps[SnapshotState] = WholeMaps(
 
 
 def snapshot_panels(modes: int) -> list[fits.Panel[SnapshotState]]:
-    """Every quantity that is drawn of a snapshot, for an ansatz of so many modes."""
-    spectra, fields = ("4", "5") if modes <= 1 else ("", "")  # the paper has one
+    """All quantities that are drawn for a snapshot; ``modes``: number of modes of the ansatz."""
+    spectra, fields = ("4", "5") if modes <= 1 else ("", "")  # the paper has one mode
     return [
         fits.Panel("images", "image", _image, figure=spectra),
         *fits.spectrum_panels("images", spectra, "snapshots", fits.always),
@@ -182,8 +182,8 @@ def snapshot_panels(modes: int) -> list[fits.Panel[SnapshotState]]:
 def experiment_report(summary: Summary, data: ExperimentData | None = None) -> Report:
     """The report of a virtual experiment.
 
-    ``summary``: the content of ``summary.json``. ``data``: what its figures show; without, the
-    report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``data``: the data of the figures; if None, the
+    report has no figures, as for the terminal.
     """
     case = summary.get("case", {})
     imperfection = case.get("experiment", {}).get("imperfection")
@@ -235,7 +235,7 @@ def _known(state: SnapshotState) -> KnownFields:
 
 
 def critical_line(strain: float | None, material: Mapping[str, Any] | None) -> str:
-    """A sentence on the critical strain [-], None if the path has no bifurcation, and of what."""
+    """Sentence on the critical strain [-] (None: no bifurcation) and, if given, the material."""
     text = text_of("experiment-no-bifurcation")
     if strain is not None:
         text = f"Critical strain {100 * strain:.4f} %"
@@ -250,7 +250,7 @@ def _expected(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
-    """The few numbers at the top."""
+    """The key numbers at the top of the page, of the last snapshot."""
     last = summary["snapshots"][-1]
     at = f"at {percent(last['nominal_strain'])}"
     critical = summary.get("critical_strain")
@@ -273,7 +273,7 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
 
 
 def _mode_key(last: Snapshot, at: str) -> KeyNumber:
-    """The mode against the ideal one; of several modes, how many are observable."""
+    """Deviation of the mode from the ideal one; for several modes, the number observable."""
     if "modes" in last:
         observable = [mode["observable"] for mode in last["modes"]]
         return KeyNumber.of("modes", f"{sum(observable)} of {len(observable)}", at=at)
@@ -283,12 +283,12 @@ def _mode_key(last: Snapshot, at: str) -> KeyNumber:
 
 
 def _symbol(snapshot: Snapshot) -> str:
-    """The pattern, of one mode or of several."""
+    """Symbol of the pattern, for one mode or for several."""
     return "Σ vᵢφᵢ" if "modes" in snapshot else "v₁φ₁"
 
 
 def expected_cards(name: str, rows: Sequence[Mapping[str, Any]]) -> list[Card]:
-    """The table of that name of obtained values against expected ones, and which were met."""
+    """The table ``name`` of obtained and expected values, and whether each is met; or no card."""
     marks = {True: Mark("✓ met", True), False: Mark("✗ missed", False), None: None}
     records = [{**row, "unit": row["unit"].replace("-", "–"), "ok": marks[row["ok"]]}
                for row in rows]  # fmt: skip
@@ -296,7 +296,7 @@ def expected_cards(name: str, rows: Sequence[Mapping[str, Any]]) -> list[Card]:
 
 
 def number_cards(summary: Summary) -> list[Card]:
-    """Tables of all snapshots; rows that no snapshot has are left out."""
+    """Tables of all snapshots; rows without a value in any snapshot are left out."""
     snapshots, critical = summary["snapshots"], summary.get("critical_strain")
     heads = headings(SnapshotSummary, WholeFieldSummary)
     heads = {k: head.replace("v₁φ₁", _symbol(snapshots[0])) for k, head in heads.items()}
@@ -309,7 +309,7 @@ def number_cards(summary: Summary) -> list[Card]:
 
 
 def _mode_cards(summary: Summary) -> list[Card]:
-    """The modes' parameters, each with both standard errors, and the best fit's."""
+    """Table of the modes' parameters with both standard errors, beside those of the best fit."""
     found = [(percent(s["nominal_strain"]), modes)
              for s in summary["snapshots"] if (modes := _modes_of(s))]  # fmt: skip
     several = bool(found) and len(found[0][1]) > 1
@@ -327,7 +327,7 @@ def _mode_cards(summary: Summary) -> list[Card]:
 
 
 def _modes_of(snapshot: Snapshot) -> Sequence[Mapping[str, Any]]:
-    """The modes with parameters, in the same form for one and for several."""
+    """The modes with their parameters, in the same form for one mode and for several."""
     if "modes" in snapshot:
         return list(snapshot["modes"])
     if len(snapshot.get("mode", ())) != len(_MODE):
@@ -342,7 +342,7 @@ def _modes_of(snapshot: Snapshot) -> Sequence[Mapping[str, Any]]:
 
 
 def _parameter(mode: Mapping[str, Any], k: int) -> list[Cell]:
-    """Parameter k with its standard errors, and the best fit's."""
+    """Parameter k (from 0) with its standard errors, and its value in the best fit."""
     noise, model, best = (mode[key][k] if mode[key] else None
                           for key in ("standard_error", "model_error", "best_fit"))  # fmt: skip
     errors = float("inf") if noise is None else noise, model
@@ -350,7 +350,7 @@ def _parameter(mode: Mapping[str, Any], k: int) -> list[Cell]:
 
 
 def experiment_figures(data: ExperimentData) -> list[ReportFigure]:
-    """The figures that :func:`experiment_report` refers to, before there is a summary."""
+    """The figures of :func:`experiment_report`, to be drawn before the summary is available."""
     cards = [
         *_path_cards(data.solution),
         *(fits.convergence_card(state) for state in data.states),
@@ -382,7 +382,7 @@ def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
 
 
 def panel_numbers(key: str, snapshot: Snapshot) -> str:
-    """One line of numbers under the picture of a panel; empty if there is nothing to add."""
+    """Line of numbers below the picture of a panel; empty if there is nothing to add."""
     if key == "residual":
         return f"rms {snapshot['rms_residual']:.3g} of full scale"
     if key.startswith("whole-"):
@@ -393,7 +393,7 @@ def panel_numbers(key: str, snapshot: Snapshot) -> str:
 
 
 def _path_cards(solution: Solution) -> list[Card]:
-    """Load path and eigenvalues, where the solution has them."""
+    """Load path and eigenvalues, if the solution has them."""
     path, critical = solution.info.get("path"), solution.info.get("critical")
     if not path or not path.get("primary", {}).get("nominal_strain"):
         return []
@@ -403,7 +403,7 @@ def _path_cards(solution: Solution) -> list[Card]:
 
 
 def notes(summary: Summary) -> list[str]:
-    """What a reader should know before trusting the numbers, drawn from the data."""
+    """Notes on the conditions and limits of the numbers, made from the data."""
     expected, outcome = summary.get("expected"), summary.get("simulation_outcome") or "complete"
     return [
         *([] if expected else [text_of("experiment-not-expected")]),
@@ -417,7 +417,7 @@ def notes(summary: Summary) -> list[str]:
 
 
 def _standard_errors(summary: Summary) -> str:
-    """What the standard errors mean for these images."""
+    """Text on the meaning of the standard errors for these images."""
     noise = [s["noise_sd"] for s in summary["snapshots"] if s.get("noise_sd") is not None]
     sensor = Sensor(**summary.get("case", {}).get("imaging", {}).get("sensor", {}))
     text = text_of("experiment-noise-free")
@@ -429,7 +429,7 @@ def _standard_errors(summary: Summary) -> str:
 
 
 def _about(snapshot: Snapshot) -> list[str]:
-    """Warnings about one snapshot."""
+    """Notes on one snapshot."""
     at = f"At {100 * snapshot['nominal_strain']:.4g} %"
     text = []
     if snapshot.get("negative_pivots"):
@@ -441,7 +441,7 @@ def _about(snapshot: Snapshot) -> list[str]:
     text += [f"{at} {warning}." for warning in snapshot.get("identifiability_warnings", ())]
     if "residual_verdict" in snapshot:
         text.append(f"{at} {_lower(snapshot['residual_verdict'])}")
-    if snapshot.get("noise_sd") and "weighting" in snapshot:  # a choice that noise asks for
+    if snapshot.get("noise_sd") and "weighting" in snapshot:  # a choice made because of the noise
         text.append(f"{at} {_lower(snapshot['weighting'])}")
     inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
     if inner is not None and corners is not None and inner < corners:
@@ -453,7 +453,7 @@ def _about(snapshot: Snapshot) -> list[str]:
 
 
 def outcome_text(state: Mapping[str, Any]) -> str:
-    """How the correlation of a snapshot or of a photograph ended, and why."""
+    """The outcome of a snapshot's or a photograph's correlation, and the reason."""
     return f"the correlation ended as “{state['outcome']}”: {state['outcome_why']}"
 
 
@@ -462,10 +462,10 @@ def _lower(text: str) -> str:
 
 
 def _is_free(snapshot: Snapshot) -> bool:
-    """Whether the mode's parameters were unknowns."""
+    """Whether the mode's parameters were unknowns of the correlation."""
     return bool(snapshot.get("mode_deviation_percent"))
 
 
 def _largest_deviation(snapshot: Snapshot) -> float:
-    """Largest deviation of a mode parameter from the ideal [%]; NaN without a mode."""
+    """Largest deviation of a mode parameter from its ideal value [%]; NaN if none is known."""
     return max((abs(v) for v in snapshot.get("mode_deviation_percent", ())), default=float("nan"))

@@ -1,7 +1,7 @@
-"""Fields to explore on a page: sampled, quantised, packed, with the program that shows them.
+"""Interactive display of fields on a page: sampling, quantisation and compression of their values.
 
-A page may hold fields as numbers, too, which ``explore.js`` unpacks, draws and saves. What is
-offered, and how it follows from the arrays stored, is in ``explore.toml``.
+The page contains arrays of numbers, which ``explore.js`` unpacks, draws and saves. The quantities
+offered, and how they are computed from these arrays, are defined in ``explore.toml``.
 """
 
 from __future__ import annotations
@@ -38,46 +38,46 @@ from modeharvest.validation.scoring.score import Grading, Score
 from modeharvest.validation.truth import lengths
 
 MOST_SAMPLES, LENGTH_STEP = 2_700_000, 1e-3
-"""Numbers on a page, at most: about a byte each; lengths are quantised to this [px], or to 1/65535
-of their range if that is more."""
-_LEVELS, _COARSE = 65535, 1000  # steps of an array's range: at most, and enough for the eye
+"""Largest count of values on a page, of about a byte each; quantisation step of lengths [px], at
+least 1/65535 and at most 1/1000 of an array's range."""
+_LEVELS, _COARSE = 65535, 1000  # largest and smallest number of steps in an array's range
 _SHARES, _FEW, _STATES = (0.002, 0.998), 8, 40
 
 
 @dataclass(frozen=True, eq=False)
 class ExploredState:
-    """A deformed state, or a code's field: its arrays on the sampled pixels."""
+    """Arrays of a deformed state, or of a DIC code's field, on the sampled pixels."""
 
     name: str
     label: str
-    """Ending of its static pictures' anchors, and what it is called."""
+    """Last part of the anchors of the state's static figures, and the state's label."""
     arrays: Mapping[str, FloatArray]
     boundary: FloatArray | None = None
-    """(rows, cols) by name, NaN where unknown, and (n, 2) of the boundary's nodes, if known: as
-    ``ux`` and ``uy`` displacements, which move the material [mm or px]."""
+    """Arrays (rows, cols) by name, NaN where unknown; displacement (n, 2) of the mesh's nodes, if
+    known. It and the arrays ``ux`` and ``uy`` displace the drawn material [mm or px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Explorer:
-    """Fields of several states, on the pixels in the middle of a map's cells."""
+    """Fields of several states, sampled at the middle pixels of a map's cells."""
 
     kind: str
-    """Table of ``explore.toml``."""
+    """Name of the table in ``explore.toml``."""
     frame: MapFrame
     grid: PixelGrid
-    """The images' pixels."""
+    """Pixels of the images."""
     states: Sequence[ExploredState]
     unit: str = "mm"
-    """Of positions and lengths: mm or px."""
+    """Unit of positions and lengths, mm or px."""
 
     def html(self) -> Markup:
-        """The part of a page that shows it, numbers and program included."""
+        """HTML of the interactive display, including data and program."""
         content = json.dumps(self.content(), separators=(",", ":"), allow_nan=False)
         safe = Markup(content.replace("<", "\\u003c"))
         return Markup(page_template("explore.html").render(content=safe, explorer=self))
 
     def content(self) -> dict[str, Any]:
-        """Everything that ``explore.js`` needs, as plain values."""
+        """All data that ``explore.js`` needs, as plain values."""
         packer, frame, quantities = Packer(), self.frame, _quantities(self.kind, self.states)
         sampled, (rows, cols) = middle_pixels(frame, self.grid), frame.pixels
         steps, small = _tables()["steps"], LENGTH_STEP * self.grid.pixel_size
@@ -109,7 +109,7 @@ class Explorer:
 
 
 class Packer:
-    """Arrays as text: quantised to 16 bits, predicted from their neighbours, deflated, base64."""
+    """Encodes arrays as text: 16-bit quantisation, prediction from neighbours, deflate, base64."""
 
     def __init__(self) -> None:
         self.packed: list[dict[str, Any]] = []
@@ -117,7 +117,7 @@ class Packer:
         self._known: dict[bytes, tuple[int, tuple[IntArray, ...]]] = {}
 
     def add(self, values: FloatArray, step: float) -> int:
-        """Pack (rows, cols), NaN where unknown; returns its number."""
+        """Pack an array (rows, cols), NaN where unknown; returns its index in ``packed``."""
         valid = np.isfinite(values)
         mask, nearest = self._mask(valid) if not valid.all() else (-1, None)
         whole = values if nearest is None else values[nearest]
@@ -128,7 +128,7 @@ class Packer:
         return len(self.packed) - 1
 
     def _mask(self, valid: BoolArray) -> tuple[int, tuple[IntArray, ...]]:
-        """Number of a mask (rows, cols), and the indices of each pixel's nearest valid one."""
+        """Index of a mask (rows, cols) in ``masks``, and indices of each pixel's nearest valid."""
         bits = np.packbits(valid, bitorder="little").tobytes()
         if bits not in self._known:
             away = ndimage.distance_transform_edt(~valid, None, False, True)
@@ -138,9 +138,9 @@ class Packer:
 
 
 def deflated(levels: NDArray[np.uint16]) -> dict[str, Any]:
-    """(rows, cols) deflated, low bytes before high ones; of two ways the shorter.
+    """Deflate an array (rows, cols), all low bytes before all high ones.
 
-    Smooth fields are differences to what three neighbours predict: left + upper - upper left.
+    Encodes values, or if shorter, differences from a prediction: left + upper - upper left.
     """
     change = levels.copy()
     change[1:] -= levels[:-1]
@@ -158,7 +158,7 @@ def _tables() -> dict[str, Any]:
 
 
 def _quantities(kind: str, states: Iterable[ExploredState]) -> list[dict[str, Any]]:
-    """The entries of a kind whose arrays some state has; those with {n} for each of nine modes."""
+    """Entries of ``kind`` whose arrays exist in some state; those with {n} for modes 1 to 9."""
     have, found = sorted({name for state in states for name in state.arrays}), []
     for entry, n in product(_tables()[kind], range(1, 10)):
         text = json.dumps(entry, ensure_ascii=False)
@@ -170,7 +170,7 @@ def _quantities(kind: str, states: Iterable[ExploredState]) -> list[dict[str, An
 
 
 def _terms(sums: Iterable[str], have: Sequence[str]) -> list[dict[str, float]]:
-    """Sums as they are written, "ux - f*x", by array, * being any mode; none if one is missing."""
+    """Coefficients, by array, of sums like "ux - f*x", * being any mode; [] if one is missing."""
     parts: list[dict[str, float]] = []
     for text in sums:
         parts.append({})
@@ -183,7 +183,7 @@ def _terms(sums: Iterable[str], have: Sequence[str]) -> list[dict[str, float]]:
 
 
 def _ends(state: ExploredState, terms: Sequence[Mapping[str, float]]) -> list[float] | None:
-    """Where a quantity's colours end, by shares of its values, and the least and the largest."""
+    """Ends of a quantity's colours (quantiles), its minimum and maximum; None if not known."""
     if not all(name in state.arrays for part in terms for name in part):
         return None
     sums = [np.sum([c * state.arrays[n] for n, c in part.items()], axis=0) for part in terms]
@@ -194,14 +194,14 @@ def _ends(state: ExploredState, terms: Sequence[Mapping[str, float]]) -> list[fl
 
 
 def _frame(boundary: MeshBoundary, grid: PixelGrid, arrays: int, material_px: int) -> MapFrame:
-    """The frame on which so many arrays, each with so many pixels of material, fit on a page."""
+    """Finest frame for a number of arrays, each of ``material_px`` pixels, that fits on a page."""
     factor = max(1, int(np.ceil(np.sqrt(arrays * material_px / MOST_SAMPLES))))
     return MapFrame.of(boundary, grid, max(1, max(grid.shape) // factor))
 
 
 @dataclass(frozen=True, eq=False)
 class KnownFields:
-    """What is known of a fitted state beside its ansatz: u (rows, cols, 2) [mm], f - g(x + u)."""
+    """Further data of a fitted state: true u (rows, cols, 2) [mm], best fit, whole u, residual."""
 
     truth: FloatArray | None = None
     best: Result | None = None
@@ -210,7 +210,7 @@ class KnownFields:
 
 
 def explored_fits(states: Sequence[S], known_of: Callable[[S], KnownFields]) -> str:
-    """HTML of what was fitted to images of one specimen, with errors where the truth is known."""
+    """HTML to explore fits to images of one specimen, with errors if the truth is known."""
     view, modes = states[0].view, max(len(s.result.ansatz.modes) for s in states)
     known = [known_of(s) for s in states]
     arrays = 7 + 3 * modes + 3 * any(k.whole is not None for k in known)
@@ -226,7 +226,7 @@ def explored_fits(states: Sequence[S], known_of: Callable[[S], KnownFields]) -> 
 
 
 def _fitted(state: FittedState, known: KnownFields, frame: MapFrame) -> dict[str, NDArray[Any]]:
-    """The arrays of a fitted state, by the names that ``explore.toml`` has."""
+    """Arrays of a fitted state, by their names in ``explore.toml``."""
     result, grid = state.result, middle_pixels(frame, state.view.grid)
     u = result.displacement(grid)
     arrays: dict[str, NDArray[Any]] = {"u": u}
@@ -247,7 +247,7 @@ def _fitted(state: FittedState, known: KnownFields, frame: MapFrame) -> dict[str
 
 
 def explored_photographs(states: Sequence[S], truth_of: Any, residual_of: Any) -> str:
-    """HTML of what was fitted to photographs, with errors where these are a simulation's."""
+    """HTML to explore fits to photographs, with errors if these were simulated."""
 
     def known(state: Any) -> KnownFields:
         true, whole = truth_of(state), state.frame.whole
@@ -258,8 +258,8 @@ def explored_photographs(states: Sequence[S], truth_of: Any, residual_of: Any) -
 
 
 def explored_images(results: Mapping[str, NodalResult], unit: str, residual: Any) -> str:
-    """HTML of what was measured in images on one mesh; of a few, the residuals of speckle, too."""
-    names = [*results][:: -(1 + len(results) // _STATES)][::-1]  # the last one and some before
+    """HTML to explore images measured on one mesh; with residuals if there are at most _FEW."""
+    names = [*results][:: -(1 + len(results) // _STATES)][::-1]  # every n-th, including the last
     one, made = results[names[0]], []
     frame = _frame(MeshBoundary.of(one.mesh), one.grid, 7 * len(names), one.pixels)
     grid = middle_pixels(frame, one.grid)
@@ -275,7 +275,7 @@ def explored_images(results: Mapping[str, NodalResult], unit: str, residual: Any
 
 
 def explored_scores(grading: Grading, nearest: Callable[[MapFrame, Score], IntArray]) -> str:
-    """HTML of graded fields; ``nearest``: number of the point that each cell of a map shows."""
+    """HTML to explore graded fields; ``nearest``: index of the point shown in each map cell."""
     truth, made = grading.truth, []
     boundary, arrays = MeshBoundary.of(truth.solution.mesh), 4 * len(grading.scores)
     frame = _frame(boundary, truth.grid, arrays, int(truth.mask.sum()))
@@ -290,7 +290,7 @@ def explored_scores(grading: Grading, nearest: Callable[[MapFrame, Score], IntAr
 
 
 def split(arrays: Mapping[str, NDArray[Any]], where: Any = True) -> dict[str, FloatArray]:
-    """Vector fields (rows, cols, 2) as their components, "u" as "ux", "uy"; NaN elsewhere."""
+    """Split vector fields (rows, cols, 2), "u" into "ux" and "uy"; NaN where ``where`` is False."""
     parts = {name: array for name, array in arrays.items() if array.ndim == 2}
     for name, array in arrays.items():
         if array.ndim == 3:

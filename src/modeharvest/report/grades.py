@@ -57,11 +57,11 @@ from modeharvest.validation.scoring.star_grades import (
 _CELLS = 300
 _SHARES = np.logspace(-4, 0, 200)
 _CELL_PX = 10
-"""Edge of a cell of the star's maps; the image has far more pixels than a page."""
+"""Edge of a cell of the star's maps [px]; the image has far more pixels than a page can show."""
 
 
 def length_scale(scores: Sequence[Score]) -> maps.ColourScale:
-    """A logarithmic scale on which 98 % of every field's errors are distinguished."""
+    """Logarithmic scale [px] from 2nd to 98th percentiles of all errors, at most four decades."""
     lengths = [_error_length(graded) for graded in scores if len(graded.error_px)]
     ends = [np.quantile(one[one > 0], (0.02, 0.98)) for one in lengths if (one > 0).any()]
     low = min((end[0] for end in ends), default=1e-3)
@@ -72,14 +72,14 @@ def length_scale(scores: Sequence[Score]) -> maps.ColourScale:
 
 @dataclass(frozen=True, eq=False)
 class ErrorMaps:
-    """The maps of one field's errors; blank where nothing was measured."""
+    """Maps of the errors of one displacement field; blank where nothing was measured."""
 
     map_frame: maps.MapFrame
     graded: Score
 
     @cached_property
     def nearest(self) -> NDArray[np.intp]:
-        """(rows, cols) of the map: number of the nearest point, the count of all if too far."""
+        """(rows, cols) index of each map cell's nearest point; the number of points if too far."""
         graded, grid = self.graded, self.map_frame.grid
         if not len(graded.x):
             return np.zeros(grid.shape, dtype=np.intp)
@@ -93,17 +93,17 @@ class ErrorMaps:
         return maps.draw_field(self.map_frame, np.append(values, np.nan)[self.nearest], scale)
 
     def draw_length(self, scale: maps.ColourScale) -> Figure:
-        """Draw the error's length; 0 has no logarithm."""
+        """Draw the length of the error; 0, which has no logarithm, in the scale's lowest colour."""
         return self._draw(np.maximum(_error_length(self.graded), 1e-3 * scale.low), scale)
 
     def draw_component(self, component: int) -> Figure:
-        """Draw the error along x (0) or y (1), on a scale of its own."""
+        """Draw the error along x (0) or y (1); both components of a field have the same scale."""
         error = self.graded.error_px
         return self._draw(error[:, component], maps.ColourScale.signed(error, "px", 0.98))
 
 
 def draw_distribution(scores: Sequence[Score]) -> Figure:
-    """Draw which share of a field's points, lost ones counted as wrong, errs by more."""
+    """Draw the share of points with a larger error, over the error; lost points count as larger."""
     drawn, axes = curve("length of the error [px]", "share of points with a larger error [%]")
     for n, graded in enumerate(scores):
         length, points = np.sort(_error_length(graded))[::-1], graded.everywhere.points
@@ -117,7 +117,7 @@ def draw_distribution(scores: Sequence[Score]) -> Figure:
 
 
 def draw_histogram(scores: Sequence[Score]) -> Figure:
-    """Draw how many of a field's points err by how much, in tenths of a decade."""
+    """Draw a histogram of the errors' lengths, in tenths of a decade, one curve for each field."""
     drawn, axes = curve("length of the error [px]", "share of points per tenth of a decade [%]")
     for n, graded in enumerate(scores):
         length = np.maximum(_error_length(graded), 1e-9)
@@ -131,7 +131,7 @@ def draw_histogram(scores: Sequence[Score]) -> Figure:
 
 
 def draw_regions(scores: Sequence[Score]) -> Figure:
-    """Draw bars of the rms error by region."""
+    """Draw the rms error in each region as bars."""
     drawn, axes = curve("", "rms per component [px]")
     width = 0.8 / max(len(scores), 1)
     for n, graded in enumerate(scores):
@@ -145,7 +145,7 @@ def draw_regions(scores: Sequence[Score]) -> Figure:
 
 
 def draw_spectra(spectra: Mapping[str, ErrorSpectrum | None]) -> Figure:
-    """Draw the rms error by wavelength, in thirds of an octave."""
+    """Draw the rms error over the wavelength, in thirds of an octave."""
     drawn, axes = curve("wavelength [px]", "rms per component in a third of an octave [px]")
     for n, (name, spectrum) in enumerate(spectra.items()):
         if spectrum is not None and (spectrum.rms_px > 0).any():
@@ -155,7 +155,7 @@ def draw_spectra(spectra: Mapping[str, ErrorSpectrum | None]) -> Figure:
 
 
 def _finished(drawn: Figure) -> Figure:
-    """Names above the curves, and plain numbers on logarithmic axes."""
+    """Add a legend above the curves, and plain numbers on logarithmic axes."""
     axes = drawn.axes[0]
     plain_ticks(*(axis for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"))
     legend_above(axes)
@@ -167,9 +167,9 @@ def _error_length(graded: Score) -> FloatArray:
 
 
 def write_grading(folder: Path | str, grading: Grading | StarGrading) -> None:
-    """Write a grading as JSON, CSV and ``report.html``, each whole or not at all.
+    """Write a grading as JSON, CSV and ``report.html``, each file atomically.
 
-    The files are ``scores`` of displacement fields, and ``resolution`` of the star pattern.
+    JSON and CSV are named ``scores`` for displacement fields, ``resolution`` for the star pattern.
     """
     if isinstance(grading, Grading):
         path, report = Path(folder, "scores"), grading_report(grading)
@@ -184,7 +184,7 @@ def write_grading(folder: Path | str, grading: Grading | StarGrading) -> None:
 
 
 def grading_report(grading: Grading) -> Report:
-    """The report of displacement fields, graded and ranked."""
+    """The report of graded and ranked displacement fields."""
     scores, best = grading.scores, grading.scores[0]
     boundary = MeshBoundary.of(grading.truth.solution.mesh)
     frame, scale = maps.MapFrame.of(boundary, grading.truth.grid, _CELLS), length_scale(scores)
@@ -277,7 +277,7 @@ def _score_maps(drawn: ErrorMaps, scale: maps.ColourScale, n: int) -> Card:
 
 
 def draw_attenuation(grades: Sequence[StarGrade]) -> Figure:
-    """Draw T over the period, a band of two standard errors about it, and where it crosses 0.9."""
+    """Draw T over the period with a band of ± two standard errors; dots where it rises to 0.9."""
     drawn, axes = curve("period of the wave [px]", "measured over true amplitude [–]")
     axes.axhline(KEPT, color=style.MUTED, linestyle=":", linewidth=1)
     for n, grade in enumerate(grades):
@@ -293,7 +293,7 @@ def draw_attenuation(grades: Sequence[StarGrade]) -> Figure:
 
 
 def draw_trade_off(grades: Sequence[StarGrade]) -> Figure:
-    """Draw the noise floor over l10, lines of equal indicator below."""
+    """Draw the noise floor n over l10, with lines of equal indicator n l10 in the background."""
     known = [g for g in grades if np.isfinite(g.indicator_px2) and g.indicator_px2 > 0.0]
     drawn, axes = curve("l₁₀ % [px]", "noise floor n [px]")
     x = [g.attenuation.finest_px for g in known]
@@ -317,7 +317,7 @@ def draw_trade_off(grades: Sequence[StarGrade]) -> Figure:
 
 
 def draw_centre_row(found: Attenuation, look: str = style.BLUE) -> Figure:
-    """Draw the centre row's T, raw, and the smoothed curve through all rows."""
+    """Draw the unsmoothed T of the centre row, and the smoothed T of all rows near it."""
     drawn, axes = curve("period of the wave [px]", "measured over true [–]", (9.0, 2.1))
     axes.plot(found.centre.period, found.centre.share, color=style.MUTED, linewidth=0.5, alpha=0.8)
     axes.plot(found.period, found.curve[0], color=look, linewidth=1.8)
@@ -328,9 +328,9 @@ def draw_centre_row(found: Attenuation, look: str = style.BLUE) -> Figure:
 
 
 def draw_map(grade: StarGrade, values: FloatArray, end: float | None = None) -> Figure:
-    """Draw displacements or errors (n,) of a code's points along y [px], down is positive.
+    """Draw displacements or errors (n,) along y at a code's points [px], positive downwards.
 
-    ``end`` is that of the colours; by default what 99 % of the values stay below.
+    ``end``: end of the colour scale [px]; by default the 99th percentile of the magnitudes.
     """
     star = grade.star
     valid = np.isfinite(values)
@@ -357,14 +357,14 @@ def draw_map(grade: StarGrade, values: FloatArray, end: float | None = None) -> 
 
 
 def _round_values(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten from below ``low`` to above ``high``."""
+    """1, 2 and 5 times powers of ten, from 0.3 times ``low`` to 3 times ``high``."""
     first, last = int(np.floor(np.log10(low))) - 1, int(np.ceil(np.log10(high))) + 1
     every = [m * 10.0**p for p in range(first, last + 1) for m in (1, 2, 5)]
     return [v for v in every if 0.3 * low <= v <= 3.0 * high]
 
 
 def star_report(grading: StarGrading) -> Report:
-    """The report of codes that measured the star pattern."""
+    """The report of codes graded on the star pattern."""
     grades, star = grading.grades, grading.star_set.spec.star
     rows = [grade_numbers(grade) for grade in grades]
     best, several = rows[0], len(rows) > 1

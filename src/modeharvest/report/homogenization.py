@@ -1,4 +1,4 @@
-"""Report of a homogenized specimen: beside the direct simulation, and beside what was measured."""
+"""Report of a homogenized specimen, compared with direct simulation and with measurement."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ Summary = Mapping[str, Any]
 def homogenization_report(summary: Summary, data: HomogenizationData | None = None) -> Report:
     """The report of a homogenized specimen.
 
-    ``summary``: the content of ``summary.json``. ``data``: what its figures show; without, the
-    report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``data``: the data of the figures; if None, the
+    report has no figures, as for the terminal.
     """
     table = ReportTable.of("homogenized-states", map(_state_row, _pairs(summary)))
     branches = ReportTable.of("homogenized-branches", map(_branch_row, summary["branches"]))
@@ -63,12 +63,12 @@ def homogenization_report(summary: Summary, data: HomogenizationData | None = No
 
 
 def _off(value: float | None, of: float | None) -> float | None:
-    """How far a value is from another one [%]."""
+    """Relative difference of a value from ``of`` [%]; None if one is missing, or ``of`` is 0."""
     return None if value is None or not of else 100.0 * (value / of - 1.0)
 
 
 def _pairs(summary: Summary) -> list[tuple[Mapping[str, Any], Mapping[str, Any] | None]]:
-    """Homogenized states with the direct ones at their strains."""
+    """Homogenized states, each with the directly simulated one at its strain, None without one."""
     direct = {state["nominal_strain"]: state for state in summary["direct"]["states"]}
     return [(state, direct.get(state["nominal_strain"])) for state in summary["states"]]
 
@@ -92,7 +92,7 @@ def _branch_row(branch: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def findings(summary: Summary) -> list[str]:
-    """What was found, in sentences."""
+    """The results in sentences."""
     text, critical, direct = [], summary["critical_strain"], summary["direct"]["critical_strain"]
     if critical is None:
         text.append(text_of("homogenized-no-critical", outcome=summary["outcome"]))
@@ -127,7 +127,7 @@ def findings(summary: Summary) -> list[str]:
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
-    """The few numbers at the top."""
+    """The key numbers at the top of the page."""
     critical, direct = summary["critical_strain"], summary["direct"]["critical_strain"]
     off = _off(critical, direct)
     remark = "" if off is None else f"{off:+.1f} % from the direct simulation's"

@@ -1,4 +1,4 @@
-"""Report of an identification: parameters with intervals, force against strain, residuals."""
+"""Report of an identification: parameters and their errors, force over strain, residuals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from modeharvest.report.model import (
 Summary = Mapping[str, Any]
 _TEST = "{chi_squared:.4g} of {degrees_of_freedom}, p = {p_value:.2g}"
 _PARTS = ("x", "y", "diameter", "ovality along the axes", "ovality along the diagonals")
-_HOLES_SHOWN = 0.15  # of a diameter: as which the largest change of a hole is drawn, about
+_HOLES_SHOWN = 0.15  # approximate largest change of a hole as drawn, over its diameter [-]
 
 
 def identification_report(
@@ -39,8 +39,8 @@ def identification_report(
 ) -> Report:
     """The report of an identification.
 
-    ``summary``: the content of ``summary.json``. ``found``, ``data``: what its residual
-    images show; without, the report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``found``, ``data``: the identified model and the
+    data of its states, for the figures of force and residuals; without them, these are left out.
     """
     parameters = summary["parameters"]
     table = ReportTable.of("identified", map(_row, parameters))

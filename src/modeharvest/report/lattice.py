@@ -1,4 +1,4 @@
-"""Report of an infinite lattice: one page like the paper's Figs. "modes" and "graded"."""
+"""Report of an infinite lattice, with figures like the paper's Figs. "modes" and "graded"."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from modeharvest.validation.studies.lattice import LatticeModeStudy, ModeRow, Pa
 Summary = Mapping[str, Any]
 
 CELLS = 4
-"""Unit cells along the side of a picture's window."""
+"""Side of the part of the lattice that a figure shows [unit cells]."""
 VISIBLE = 0.12
-"""Largest fluctuation that a deformed lattice is drawn with, at least [l]."""
+"""A deformed lattice whose largest fluctuation is less is drawn magnified to this value [l]."""
 _KINDS = {
     "pattern": "(π, π)",
     "long waves": "long waves",
@@ -59,8 +59,8 @@ _KINDS = {
 def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
     """The report of a lattice.
 
-    ``summary``: the content of ``summary.json``. ``run``: what its figures show; without, the
-    report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``run``: the data of the figures; if None, the
+    report has no figures, as for the terminal.
     """
     return Report(
         kind="lattice",
@@ -90,7 +90,7 @@ def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
 
 
 def wave_name(wave: Wave | Sequence[float]) -> str:
-    """Phases in units of pi where they are simple fractions of it: "(π, 0)", "(4π/3, 2π/3)"."""
+    """A wave's phases [rad], as multiples of pi where these are simple: "(4π/3, 2π/3)"."""
     return f"({', '.join(_phase(phase) for phase in wave)})"
 
 
@@ -106,7 +106,7 @@ def _phase(phase: float) -> str:
 
 
 def waves_text(critical: Mapping[str, Any]) -> str:
-    """The critical waves, long ones by their direction."""
+    """The critical waves as text: their phases, or the direction of long waves; "–" if none."""
     if not critical["found"]:
         return "–"
     if critical["long_wave_angle"] is not None:
@@ -115,7 +115,7 @@ def waves_text(critical: Mapping[str, Any]) -> str:
 
 
 def proof(critical: Mapping[str, Any]) -> str:
-    """What shows that the point is critical, and the first one."""
+    """Text: the evidence that the load is critical, or not, and waves unstable at lower loads."""
     if not critical["found"]:
         return f"lowest filling · λ/k² is {number(critical['value'])} MPa, above zero"
     if critical["long_wave_angle"] is not None:
@@ -129,7 +129,7 @@ def proof(critical: Mapping[str, Any]) -> str:
 
 
 def findings(summary: Summary) -> list[str]:
-    """What was found, in sentences."""
+    """The results in sentences."""
     text, point, load = [], summary["critical"], LoadQuantity(**summary["load"])
     if point is not None and point["found"]:
         text.append(text_of("lattice-critical", point=point, load=load,
@@ -155,13 +155,13 @@ def findings(summary: Summary) -> list[str]:
 
 
 def _splitting(point: Mapping[str, Any] | None) -> list[str]:
-    """A warning where the mesh splits a degenerate set."""
+    """A warning if the mesh splits a degenerate set of critical waves; else none."""
     is_split = point is not None and len(point["waves"]) > 1 and point["splitting"] > 1e-5
     return [text_of("lattice-splitting", **point)] if point and is_split else []
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
-    """The few numbers at the top."""
+    """The key numbers at the top of the page."""
     keys, point, load = [], summary["critical"], LoadQuantity(**summary["load"])
     if point is not None:
         names = ["critical-load"] if point["found"] else ["stable-load", "lowest-filling"]
@@ -196,12 +196,12 @@ def _waves_key(point: Mapping[str, Any], summary: Summary) -> KeyNumber:
 
 
 def _excess(state: Mapping[str, Any]) -> float:
-    """Energy over that of the primary path at the same load [kPa]."""
+    """Stored energy per area minus that of the primary path at the same load [kPa]."""
     return 1e3 * float(state["energy"] - state["primary_energy"])
 
 
 def notes(summary: Summary) -> list[str]:
-    """What a reader should know before trusting the numbers, drawn from the data."""
+    """Notes on the conditions and limits of the numbers, made from the data."""
     text, point = [], summary["critical"]
     if point is not None and not point["found"]:
         load = LoadQuantity(**summary["load"]).text(point["load"])
@@ -216,7 +216,7 @@ def notes(summary: Summary) -> list[str]:
 
 
 def _window(run: LatticeRun, width: float = CELLS, height: float = CELLS) -> LatticePatch:
-    """Cells of the modes where there are some, primitive ones otherwise [l]."""
+    """A part of the lattice of ``width`` x ``height`` [l]: of modes' cells, else primitive ones."""
     mesh, lattice = run.mesh, run.lattice
     if run.modes is not None:
         mesh, lattice = run.modes.mesh, run.modes.lattice
@@ -236,7 +236,7 @@ def _hero(run: LatticeRun) -> ReportFigure:
 
 
 def _pattern_section(run: LatticeRun) -> Section:
-    """The reference, and for each pattern the deformed lattice and both densities."""
+    """The reference; for each pattern the deformed lattice, S_xx and S_yy."""
     drawn = partial(figures.draw_lattice, _window(run), run.pitch)
     reference = ReportFigure("reference", "Reference", drawn, "dashed: the cell that repeats")
     cards = [
@@ -250,7 +250,7 @@ def _pattern_section(run: LatticeRun) -> Section:
 
 
 def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> ReportFigure:
-    """The deformed lattice; a fluctuation that is too small to be visible is magnified."""
+    """The deformed lattice; small fluctuations are magnified, modes scaled to a fixed size."""
     assert run.modes is not None
     fluctuation = found.fluctuation
     largest = float(np.linalg.norm(fluctuation, axis=1).max()) / run.pitch
@@ -273,7 +273,7 @@ def _densities(found: FoundPattern, n: int) -> list[ReportFigure]:
     for name, S in both.items():
         up = np.where(upward(spectrum.xi), S, 0.0)
         xi = [float(x) for x in spectrum.xi[int(np.argmax(up))]]
-        of = "" if found.stable is None else f" {number(float(S.max()))} mm⁶"  # a mode has no size
+        of = "" if found.stable is None else f" {number(float(S.max()))} mm⁶"  # modes: arbitrary
         text = f"largest{of} at ±({number(xi[0])}, {number(xi[1])})"
         drawn = partial(figures.draw_lattice_spectrum, spectrum.xi, S, largest)
         made.append(ReportFigure(f"S{name}-{n}", Markup(f"S<sub>{name}</sub>"), drawn, text))
@@ -313,7 +313,7 @@ def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
 
 
 def _mode_section(run: LatticeRun, modes: ModeSet) -> Section:
-    """Every mode of the set upon the undeformed lattice."""
+    """All modes of the set, each drawn as a displacement of the undeformed lattice."""
     still, drawn = _window(run), []
     for k, (wave, value) in enumerate(zip(modes.waves, modes.eigenvalues, strict=True)):
         shape = modes.shapes[k]
@@ -337,7 +337,7 @@ def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
 
 
 def _last_state(branch: Mapping[str, Any], load: LoadQuantity) -> Mapping[str, Any]:
-    """A branch's row in the table."""
+    """The table's row of a branch: its last state."""
     named = {"name": combination_name(branch["combination"]), "outcome": branch["outcome"]}
     if not branch["states"]:
         return named | {"amplitudes": "–"}
@@ -378,7 +378,7 @@ def _family_card(found: FoundPattern) -> Card:
 
 
 def _study_section(study: LatticeModeStudy) -> Section:
-    """Curves, overlays and rows of a study."""
+    """Text, overlays of modes, curves and tables of a study."""
     overlays = [_overlay(mode, n) for n, mode in enumerate(study.overlays, start=1)]
     series = {"Hole size and loading": study.ratios, "Cell size": study.scales,
               "Material": study.materials}  # fmt: skip
@@ -396,7 +396,7 @@ def _study_section(study: LatticeModeStudy) -> Section:
 
 
 def _overlay(mode: PatternMode, n: int) -> ReportFigure:
-    """Both modes on one cell, less enlarged where small holes would close."""
+    """Numerical and analytic mode on a quarter cell, less enlarged if small holes would close."""
     row = mode.row
     size = min(DRAWN_AMPLITUDE, 0.4 * row.ratio)
     drawn = partial(figures.draw_overlay, mode.mesh, row.pitch, mode.shape, mode.analytic,
@@ -407,7 +407,7 @@ def _overlay(mode: PatternMode, n: int) -> ReportFigure:
 
 
 def _study_row(row: ModeRow) -> Mapping[str, Any]:
-    """A row of the study's tables."""
+    """A lattice's row in the tables of the study."""
     kind = _KINDS[row.kind]
     return vars(row) | {
         "first": percent(row.first) if row.found else f"> {percent(row.first)}",
@@ -420,7 +420,7 @@ def _study_row(row: ModeRow) -> Mapping[str, Any]:
 
 
 def study_text(study: LatticeModeStudy) -> list[str]:
-    """What a study shows, drawn from its rows."""
+    """The results of a study in sentences, made from its rows."""
     text = [text_of("lattice-limit", limit=limit, instead=_KINDS[limit.instead])
             for limit in study.limits]  # fmt: skip
     limited = {limit.loading for limit in study.limits}

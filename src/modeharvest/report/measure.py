@@ -31,23 +31,23 @@ from modeharvest.util.arrays import FloatArray, FloatImage
 
 Summary = Mapping[str, Any]
 Residual = Callable[[str, NodalResult], FloatArray]
-"""From an image's name and its result to (rows, cols) [grey levels]."""
+"""Returns the residual (rows, cols) [grey levels] for an image's name and its result."""
 Picture = Callable[[str], FloatImage]
-"""From an image's name to the image (rows, cols), 0 black and 1 white."""
+"""Returns the image (rows, cols), 0 black to 1 white, for an image's name."""
 
 _SHOWN = 4
-"""Images with maps of their own, at most: the last ones are spread evenly over the sequence."""
+"""Largest number of images shown as maps: evenly spaced, from the first to the last image."""
 
 
 def measure_report(
     summary: Summary, results: Mapping[str, NodalResult] | None = None,
     residual: Residual | None = None, picture: Picture | None = None, gauges: Sequence[Gauge] = (),
 ) -> Report:  # fmt: skip
-    """The report of a measurement.
+    """Make the report of a measurement.
 
-    ``summary``: the content of ``summary.json``. ``results`` by the images' names, and what gives
-    their ``residual`` and the images; without, the report has numbers only, as for the terminal.
-    ``gauges``: whose readings the summary has.
+    ``summary``: content of ``summary.json``. ``results``: results by image name; ``residual`` and
+    ``picture`` return residuals and images. Without these three, the report has numbers only, for
+    the terminal. ``gauges``: gauges whose readings are in the summary.
     """
     images = summary["images"]
     by_contours = images[-1]["shown"] == "contours"
@@ -100,7 +100,7 @@ def _cards(
     k: int, name: str, results: Mapping[str, NodalResult], residual: Residual, picture: Picture,
     unit: str,
 ) -> list[Card]:  # fmt: skip
-    """Maps of one image."""
+    """Cards with maps of one image."""
     result = results[name]
     frame = MapFrame.of(MeshBoundary.of(result.mesh), result.grid)
 
@@ -110,7 +110,7 @@ def _cards(
         return draw_field(frame, field, scale(field, what, 0.99), unit=unit)
 
     def left() -> Figure:
-        field = frame.average(residual(name, result))  # pixels on edges show the background
+        field = frame.average(residual(name, result))  # large at edges that show background
         return draw_field(frame, field, ColourScale.signed(field, "levels", 0.95), unit=unit)
 
     def seen() -> Figure:

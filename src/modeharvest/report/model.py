@@ -1,7 +1,7 @@
-"""The report model: key numbers, figures, tables and text, for a page, CSV files and the terminal.
+"""The content of a report: key numbers, figures, tables and text, for HTML, CSV and the terminal.
 
-Each kind of run has one function that makes its :class:`Report`; everything a reader sees of the
-run follows from that. Figures are functions, drawn one after the other while the page is written.
+One function for each kind of run makes its :class:`Report`, from which the page, the CSV files and
+the terminal output are written. Figures are functions, called one by one as the page is written.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def _captions() -> dict[str, dict[str, Any]]:
 
 
 def caption(name: str, **values: object) -> dict[str, Any]:
-    """Title, caption, lead … of that name in ``captions.toml``, with values filled in."""
+    """Title, caption, lead etc. in table ``name`` of ``captions.toml``, with values filled in."""
     words = _captions()[name].items()
     return {k: Markup(v).format(**values) if isinstance(v, str) else v for k, v in words}
 
 
 @dataclass(frozen=True)
 class _Readable:
-    """A value that is filled in as a function writes it, with so many digits if some are given."""
+    """A value formatted by a function; a format specification is its number of digits."""
 
     written: Callable[..., str]
     value: Any
@@ -55,10 +55,10 @@ class _Readable:
 
 
 class _Template(Formatter):
-    """Fills values into plain text: ``{x!n:3}`` as :func:`number`, ``{x!p}`` as :func:`percent`."""
+    """Fills values into plain text: ``{x!n:3}`` by :func:`number`, ``{x!p}`` by :func:`percent`."""
 
     def convert_field(self, value: Any, conversion: Any) -> Any:
-        """A field's value as its conversion says."""
+        """Apply the conversions n, p and z (four digits, keeping zeros at the end)."""
         ways: dict[str, Callable[..., str]] = {"n": number, "p": percent}
         ways["z"] = lambda x: f"{x:#.4g}" if 1e-3 <= abs(x) < 1e3 else number(x)  # 1.530
         if conversion in ways:
@@ -67,13 +67,13 @@ class _Template(Formatter):
 
 
 def text_of(name: str, /, **values: object) -> str:
-    """The text of that name in ``captions.toml``, plain text, with values filled in."""
+    """Plain text ``name`` in table ``text`` of ``captions.toml``, with values filled in."""
     return _Template().vformat(_captions()["text"][name], (), values)
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A word in a coloured pill: green if good, red if not."""
+    """A word on a coloured label: green if good, red if not."""
 
     text: str
     good: bool
@@ -81,7 +81,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Measured:
-    """A value with its standard errors, of which None is not known and infinity is no limit."""
+    """A value with its standard errors: None if not known, infinite if not determined."""
 
     value: float
     errors: tuple[float | None, ...] = ()
@@ -92,7 +92,7 @@ class Measured:
 
     @property
     def error_texts(self) -> list[str]:
-        """Each standard error: "± 0.00020", "< 0.00001" where it is less than is written."""
+        """Each standard error as text: "± 0.00020", or "< 0.00001" if it would be rounded to 0."""
         least = 0.5 * 10.0**-self.decimals
         return [
             "± –" if error is None or error != error
@@ -108,19 +108,19 @@ Cell = str | float | int | None | Mark | Measured
 
 @dataclass(frozen=True)
 class KeyNumber:
-    """One of the up to six numbers at the top of a page."""
+    """A number at the top of a page, which has up to seven."""
 
     name: str
     value: str | float | None
     unit: str = ""
     remark: str = ""
-    """What to compare it with."""
+    """Text below the number, for example a value to compare it with."""
 
     @classmethod
     def of(cls, name: str, value: str | float | None = None, /, **values: object) -> KeyNumber:
-        """The one of that name in ``captions.toml``, with values filled in.
+        """Make the key number ``name`` of ``captions.toml``, with values filled in.
 
-        Its own ``value`` is given where it is not among the words.
+        ``value`` is used if ``captions.toml`` has no value for this name.
         """
         words = _captions()["key"][name].items()
         filled: dict[str, Any] = {k: _Template().vformat(v, (), values) for k, v in words}
@@ -132,19 +132,19 @@ class ReportFigure:
     """A figure, drawn when the page is written."""
 
     name: str
-    """Its anchor, unique in the page."""
+    """HTML anchor, unique on the page."""
     label: str
-    """Written above it; may be empty."""
+    """Text above the figure; may be empty."""
     draw: Callable[[], Figure]
-    """Draws it, in the style of :mod:`modeharvest.report.figures.style`."""
+    """Draws the figure in the style of :mod:`modeharvest.report.figures.style`."""
     numbers: str = ""
-    """One line of numbers below it."""
+    """Line of numbers below the figure."""
     wide: bool = False
-    """Whether it takes the whole width of its card."""
+    """Whether the figure takes the full width of its card."""
     exact: bool = False
-    """Whether every pixel is kept: for fields as fine as the pixels."""
+    """Whether pixels are stored without loss, for fields as fine as the pixels."""
     late: bool = False
-    """Whether it is drawn after the others, as what it shows may still be computed."""
+    """Whether the figure is drawn after the others, because its data may not be ready earlier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,22 +153,22 @@ class ReportTable:
 
     title: str
     columns: Sequence[str]
-    """Headings with their units; the first column names the rows."""
+    """Headings with units; the first column names the rows."""
     rows: Sequence[Sequence[Cell]]
-    """As many cells each as there are columns."""
+    """Rows, each with one cell per column."""
     name: str = ""
-    """Its anchor; none if empty."""
+    """HTML anchor; none if empty."""
     file: str = ""
-    """A CSV file beside the page that holds the same."""
+    """Name of a CSV file with the same content, beside the page; none if empty."""
     folded: bool = False
-    """Whether the reader has to unfold it."""
     on_terminal: bool = False
+    """Whether the table is folded on the page, and whether it is also printed on the terminal."""
 
     @classmethod
     def of(
         cls, name: str, records: Iterable[Mapping[str, Any]], /, **values: object
     ) -> ReportTable:
-        """The table named ``table-name`` in ``captions.toml``: its columns of these records."""
+        """Make ``table-NAME`` of ``captions.toml`` with its columns of these records as rows."""
         words = _captions()[f"table-{name}"]
         heads, title = words["columns"], words["title"].format(**values)
         rows = [[record.get(key) for key in heads] for record in records]
@@ -181,10 +181,10 @@ class ReportTable:
         states: Sequence[tuple[str, Mapping[str, Any]]],
         heads: Mapping[str, str] | None = None,
     ) -> ReportTable:
-        """A column for each of some labelled states, a row for each quantity that one has.
+        """Make a table with a column for each labelled state and a row for each quantity.
 
-        The table is named as for :meth:`of`; ``heads``: headings of the quantities by their keys,
-        by default its columns.
+        Quantities that no state has are left out. ``name``: as for :meth:`of`; ``heads``: headings
+        of the quantities by key, by default the table's columns in ``captions.toml``.
         """
         words = dict(_captions()[f"table-{name}"])
         every = (words.pop("columns") if heads is None else heads).items()
@@ -195,7 +195,7 @@ class ReportTable:
 
     @classmethod
     def of_frame(cls, title: str, table: pd.DataFrame) -> ReportTable:
-        """A data frame as it is, with a CSV file."""
+        """Make a table of all columns of a data frame, with a CSV file."""
         rows = table.astype(object).values.tolist()
         columns = [str(column) for column in table]
         name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
@@ -203,44 +203,44 @@ class ReportTable:
 
     @property
     def numeric(self) -> list[bool]:
-        """Which columns hold numbers, as such or in words that begin with one; not the first."""
+        """Whether each column has only numbers, or texts that begin with a digit; not the first."""
         others = [all(map(_is_number, column)) for column in zip(*self.rows, strict=True)][1:]
         return [False, *others]
 
 
 @dataclass(frozen=True, eq=False)
 class Card:
-    """What belongs together on a page: figures side by side, tables, text."""
+    """A box on a page: figures side by side, tables and text on one subject."""
 
     title: str
     figures: Sequence[ReportFigure] = ()
     tables: Sequence[ReportTable] = ()
-    """The same quantity at several states, for example; in this order."""
+    """Tables in the order shown, for example one quantity at several states."""
     text: Sequence[str] | Mapping[str, Sequence[str]] = ()
-    """Statements, as a list; by headings, side by side, where it is a mapping."""
+    """Sentences shown as a list; a mapping is shown as one column of sentences per heading."""
     caption: str = ""
     name: str = ""
-    """Its anchor; none if empty."""
+    """HTML anchor; none if empty."""
     symbol: str = ""
     paper: str = ""
-    """Beside the heading: of the quantity, and its figure in the paper."""
+    """Symbol of the quantity, and its figure in the paper, shown beside the heading."""
     wide: bool = False
-    """Whether it takes the whole width of the page."""
+    """Whether the card takes the full width of the page."""
 
     @classmethod
     def captioned(cls, name: str, draw: Callable[[], Figure], **values: object) -> Card:
-        """One figure over the whole width, with the words of its name."""
+        """Make a card with one figure of full width and the texts ``name`` of ``captions.toml``."""
         return cls(**caption(name, **values), figures=[ReportFigure(name, "", draw, wide=True)])
 
     @classmethod
     def tabular(cls, table: ReportTable, **more: Any) -> list[Card]:
-        """One table under its own title; no card where it has no rows."""
+        """Make a list of one card, titled as its table; empty if the table has no rows."""
         return [cls(table.title, tables=[table], **more)] if table.rows else []
 
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A part of a page: its anchor, heading, a paragraph, and cards."""
+    """A part of a page: HTML anchor, heading, cards, and an introductory paragraph."""
 
     name: str
     title: str
@@ -249,81 +249,81 @@ class Section:
 
     @classmethod
     def of(cls, name: str, cards: Sequence[Card], text: str = "", /, **values: object) -> Section:
-        """With the title and the lead named ``text``, or as the section."""
+        """Make a section with the title and lead ``section-TEXT``, or else ``section-NAME``."""
         return cls(name, cards=cards, **caption(f"section-{text or name}", **values))
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """All that a reader sees of a run."""
+    """Content of the report of one run."""
 
     kind: str
     title: str
     lead: str = ""
-    """A paragraph on what the page is about."""
+    """Introductory paragraph."""
     findings: Sequence[str] = ()
-    """What was found, in sentences, the most important first; also on the terminal."""
+    """Results in sentences, the most important first; also printed on the terminal."""
     keys: Sequence[KeyNumber] = ()
-    """Up to six numbers to begin with."""
+    """Up to seven numbers at the top of the page."""
     sections: Sequence[Section] = ()
-    """Figures and tables; empty ones are left out."""
+    """Sections with figures and tables; those without cards are left out."""
     warnings: Sequence[str] = ()
-    """What to beware of; also on the terminal."""
+    """Warnings; also printed on the terminal."""
     notes: Sequence[str] = ()
-    """What to know before trusting the numbers."""
+    """Assumptions and limitations of the numbers."""
     command: str = ""
     remark: str = ""
-    """What makes the page again, and a word on that."""
+    """Command that makes the page again, and a remark on it."""
     case: Mapping[str, Any] = field(default_factory=dict)
     toml: str = ""
-    """What was run: plain values, or TOML text."""
+    """Input of the run, as plain values or as TOML text."""
     files: Mapping[str, str] = field(default_factory=dict)
-    """What lies beside the page, and what each file holds."""
     costs: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    """Contents of files beside the page, costs of the run, and versions of software, by name."""
     hero: ReportFigure | None = None
     hero_caption: str = ""
-    """A figure at the top, and its caption."""
+    """Figure at the top of the page, and its caption."""
     brief: ReportTable | None = None
-    """A table for the terminal alone."""
+    """Table that is printed on the terminal only."""
     explore: Callable[[], str] | None = None
-    """Makes the HTML of its fields to explore, when the page is written."""
+    """Makes the HTML of the interactive display of fields, when the page is written."""
 
     @property
     def cards(self) -> Iterator[Card]:
-        """Those of all sections."""
+        """Cards of all sections."""
         return (card for section in self.sections for card in section.cards)
 
     @property
     def figures(self) -> Iterator[ReportFigure]:
-        """Those of all cards, and the one at the top."""
+        """Figures of all cards, and the one at the top."""
         yield from (figure for card in self.cards for figure in card.figures)
         if self.hero is not None:
             yield self.hero
 
     @property
     def tables(self) -> Iterator[ReportTable]:
-        """Those of all cards."""
+        """Tables of all cards."""
         return (table for card in self.cards for table in card.tables)
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a study's table of cases shows."""
+    """Results of a study, obtained from its table of cases."""
 
     numbers: Mapping[str, Any]
-    """The study's results as plain values, with their units in the names."""
+    """Results as plain values, with units in their names."""
     text: Sequence[str]
-    """The same in sentences, the most important first."""
+    """Results in sentences, the most important first."""
     keys: Sequence[KeyNumber] = ()
-    """Up to six numbers to begin with."""
+    """Up to seven numbers at the top of the page."""
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     words: Mapping[str, object] = field(default_factory=dict)
-    """By their names; values in their captions, which are named by study and figure."""
+    """Figures by name, and values filled into their captions, which are named KIND-FIGURE."""
     tables: Sequence[ReportTable] = ()
-    """Of the page."""
+    """Tables on the page."""
     attachments: Sequence[ReportTable] = ()
-    """Tables that are files only: too long for the page, or one of its tables in numbers."""
+    """Tables written to files only: those too long for the page, and numbers behind its tables."""
 
 
 def study_report(
@@ -331,11 +331,11 @@ def study_report(
     findings: Findings | None = None,
     files: Mapping[str, str] | None = None,
 ) -> Report:
-    """The report of a study.
+    """Make the report of a study.
 
-    ``summary``: the content of ``summary.json``. ``findings``: its figures and tables; without, the
-    report is sentences only, as for the terminal. ``files``: what lies beside the page, and what
-    each file holds.
+    ``summary``: content of ``summary.json``. ``findings``: figures and tables; without them, the
+    report has text only, for the terminal. ``files``: contents of the files beside the page, by
+    file name.
     """
     found = findings or Findings({}, ())
     made = f"{summary['command']} · {summary['seeds']}"
@@ -365,7 +365,7 @@ def study_report(
 
 
 def _study_notes(summary: Mapping[str, Any]) -> list[str]:
-    """What to keep in mind of how the study went."""
+    """Notes on results that were not included, on failed cases, and on virtual experiments."""
     own = summary["versions"]["modeharvest"]
     notes = [
         f"{count} stored results of {'other options' if label == own else f'modeharvest {label}'} "
@@ -378,7 +378,7 @@ def _study_notes(summary: Mapping[str, Any]) -> list[str]:
 
 
 def draw_figures(figures: Iterable[ReportFigure], progress: Progress = silent) -> dict[str, str]:
-    """Draw figures one after the other, the late ones last; their SVG by their names."""
+    """Draw figures one by one, those marked ``late`` last; returns their SVG by name."""
     from modeharvest.report.figures.style import style, to_svg
 
     pictures = {}
@@ -397,8 +397,8 @@ def write_page(
 ) -> None:
     """Write a report as one self-contained HTML file, atomically.
 
-    ``report``: what to write. ``path``: the HTML file. ``progress``: listener. ``pictures``: what
-    :func:`draw_figures` has made of its figures before; they are drawn without.
+    ``path``: the HTML file. ``progress``: listener. ``pictures``: SVG of the report's figures from
+    :func:`draw_figures`; without it, the figures are drawn.
     """
     if pictures is None:
         pictures = draw_figures(report.figures, progress)
@@ -408,7 +408,7 @@ def write_page(
 
 @cache
 def page_template(name: str = "page.html") -> jinja2.Template:
-    """Read and compile the page, or a part of it, once in a process."""
+    """Read and compile the template of the page, or of a part of it, once per process."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -424,7 +424,7 @@ def page_template(name: str = "page.html") -> jinja2.Template:
 
 
 def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:
-    """Write every table that has a file as CSV, with all digits, atomically."""
+    """Write every table that has a file name to ``folder`` as CSV, with all digits, atomically."""
     for table in tables:
         if table.file:
             rows = [[cell if cell == cell else None for cell in row] for row in table.rows]
@@ -432,7 +432,7 @@ def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:
 
 
 def print_report(report: Report, out: Path) -> None:
-    """Print findings, tables and warnings; where the page is, last."""
+    """Print findings, tables, warnings, and the path of the page in the folder ``out``."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -448,7 +448,7 @@ def print_report(report: Report, out: Path) -> None:
         shown = Table(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD,
                         show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))  # fmt: skip
         lines: list[Sequence[Cell]] = [table.columns, *table.rows]
-        is_wide = len(lines) < len(lines[0])  # few long rows: turned, so that they fit
+        is_wide = len(lines) < len(lines[0])  # few long rows are transposed to fit
         heads, *rows = zip(*lines, strict=True) if is_wide else lines
         for n, head in enumerate(map(number, heads)):
             shown.add_column(escape(head), justify="right" if n else "left", overflow="fold")
@@ -462,9 +462,9 @@ def print_report(report: Report, out: Path) -> None:
 
 
 def number(value: Any, digits: int | None = None) -> str:
-    """A number as a reader wants it: at most four digits, a true minus, powers of ten raised.
+    """Format a number: integers in full, others with four digits at most, or as 1.2 · 10⁻⁵.
 
-    With ``digits`` it is rounded to that many before.
+    ``digits``: number of significant digits to which the number is rounded first.
     """
     if value is None:
         return "–"
@@ -485,24 +485,24 @@ def number(value: Any, digits: int | None = None) -> str:
 
 
 def ten_to(power: int) -> str:
-    """A power of ten, raised."""
+    """Format a power of ten with a superscript exponent."""
     return "10" + str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def fixed(value: float, decimals: int = 5) -> str:
-    """So many decimals, with a true minus and no minus before a zero."""
+    """Format with a fixed number of decimals and a typographic minus, but no minus before zero."""
     return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−")
 
 
 def percent(value: float | None, digits: int = 4) -> str:
-    """A share or a strain [-] in percent, with its sign."""
+    """Format a ratio or a strain [-] in percent, including the percent sign."""
     if value is None or value != value:
         return "–"
     return f"{100 * value:.{digits}g}{NBSP}%".replace("-", "−")
 
 
 def material_text(table: Mapping[str, Any]) -> str:
-    """A material's kind and constants, and whether they are this project's default.
+    """Describe a material's kind and constants, and whether they are the default ones.
 
     ``table``: ``kind`` and the constants, as in a case or in a solution's ``info``.
     """
@@ -518,7 +518,7 @@ def _plain_number(value: Any) -> str:
 
 
 def together(text: str) -> str:
-    """No line ends between a number and its unit or error."""
+    """Replace spaces between a number and its unit or error by no-break spaces."""
     return type(text)(re.sub(r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) ", NBSP, text))
 
 

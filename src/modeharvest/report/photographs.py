@@ -1,4 +1,4 @@
-"""Report of photographs: one page like the paper's Figs. 6 and 7."""
+"""Report of photographs of a test, with figures like the paper's Figs. 6 and 7."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ Summary = Mapping[str, Any]
 Frame = Mapping[str, Any]
 
 _PANELED = ("photographs", "found", "whole", "residual-and-model-error", "uncertainty", "errors")
-"""Sections of panels, in this order."""
+"""Names of the sections that have panels, in the order of the page."""
 
 
 def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Report:
     """The report of measured photographs.
 
-    ``summary``: the content of ``summary.json``. ``harvest``: what its figures show; without, the
-    report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``harvest``: the data of the figures; if None, the
+    report has no figures, as for the terminal.
     """
     frames = {frame["name"]: frame for frame in summary["frames"]}
     shown = (
@@ -87,7 +87,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         warnings=[
             *summary.get("warnings", []),
             *(f"not used: {row['name']}: {row['reason']}" for row in summary.get("skipped", [])),
-            *(f"{frame['name']}: {_capitalised(warning)}" for frame in summary["frames"]
+            *(f"{frame['name']}: {_full_stop(warning)}" for frame in summary["frames"]
               for warning in frame["warnings"]),
         ],
         notes=notes(summary),
@@ -105,21 +105,21 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
 
 
 def photograph_label(frame: Frame) -> str:
-    """What a photograph is called above its pictures."""
+    """Heading of a photograph's figures: its state, and its nominal strain [%]."""
     has = frame["has_pattern"]
     state = "Deformed" if has is None else "After buckling" if has else "Before buckling"
     return f"{state} · {percent(frame['strain'])}"
 
 
 def photograph_labels(frames: Sequence[Frame]) -> dict[str, str]:
-    """Each photograph's label by its name, which is added where labels would be the same."""
+    """Labels of photographs by their names; where labels are equal, the name is appended."""
     made = {frame["name"]: photograph_label(frame) for frame in frames}
     often = Counter(made.values())
     return {name: text if often[text] == 1 else f"{text} · {name}" for name, text in made.items()}
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
-    """The few numbers at the top."""
+    """The key numbers at the top of the page."""
     last, rows = summary["frames"][-1], [r for r in summary["truth"] if r["ok"] is not None]
     used, left = len(summary["frames"]), len(summary["skipped"])
     count, key = f"{used} of {used + left}", "some-used" if left else "all-used"
@@ -156,7 +156,7 @@ def _mode_keys(frame: Frame) -> list[KeyNumber]:
 
 
 def _two_errors(mode: Mapping[str, Any]) -> str:
-    """Standard errors of the largest v."""
+    """Text of the standard errors of the mode's amplitude where it is largest."""
     parts = [f"±\u00a0{_micro(mode['v_max_sd_noise_mm'])}\u00a0µm by noise"]
     if (sd := mode["v_max_sd_model_error_mm"]) is not None:
         parts.append(f"±\u00a0{_micro(sd)}\u00a0µm by model error")
@@ -164,7 +164,7 @@ def _two_errors(mode: Mapping[str, Any]) -> str:
 
 
 def _micro(millimetres: float | None, digits: int = 2) -> str:
-    """Micrometres; two digits do for errors."""
+    """A length [mm] as text [µm], by default with two digits, as for errors; "∞" for None."""
     return "∞" if millimetres is None else number(1e3 * millimetres, digits)
 
 
@@ -179,7 +179,7 @@ def _model_error_key(frame: Frame) -> KeyNumber:
 
 
 def panel_numbers(key: str, frame: Frame) -> str:
-    """One line of numbers under a picture; empty if there is nothing to add."""
+    """Line of numbers below a panel's picture; empty if there is nothing to add."""
     local = frame["local"]
     if key.startswith("whole-"):
         return whole_panel_numbers(key, frame["whole_field"])
@@ -206,7 +206,7 @@ def _residual_numbers(frame: Frame) -> str:
 
 
 def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[PhotographState]]:
-    """Every quantity that is drawn of one of these photographs."""
+    """All quantities that are drawn for at least one of these photographs."""
     modes = max((len(state.frame.modes) for state in states), default=0)
     parts = states[0].frame.parts if states else ()
     fields = [("v0", 0), *((name, i) for i in range(modes) for name in ("v", "fluc"))]
@@ -215,7 +215,7 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
         return state.frame.spectrum is not None
 
     def has_local(state: PhotographState) -> bool:
-        return state.frame.w is not None and state.frame.whole is None  # drawn above
+        return state.frame.w is not None and state.frame.whole is None  # else drawn above
 
     def has_residual(state: PhotographState) -> bool:
         return not state.frame.by_contours
@@ -249,7 +249,7 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
 
 
 def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographState]) -> Section:
-    """What was found in the reference, and the photographs that were not used."""
+    """Holes, lattice and scale found in the reference; the photographs that were not used."""
     lattice, px = summary["lattice"], summary["pixel_size_mm"]
     rows: list[tuple[str, Cell]] = []
     text: list[str] = []
@@ -279,7 +279,7 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
 
 
 def _optics(harvest: Harvest, summary: Summary) -> Section:
-    """Distortion, its standard deviation and its error, as far as they are known."""
+    """The lens distortion, its standard deviation and its error, as far as they are known."""
     lens, grid, numbers = harvest.optics.distortion, harvest.grid, summary["optics"]
     if lens is None:
         return Section.of("optics", [])
@@ -315,7 +315,7 @@ def _calibration_cards(numbers: Mapping[str, Any]) -> list[Card]:
 
 
 def _timeline(harvest: Harvest, summary: Summary) -> Section:
-    """The test from photograph to photograph, where there is more than one."""
+    """Amplitude, force and wave vectors over the sequence of photographs, where known."""
     cards = []
     if harvest.timeline:
         drawn = partial(draw_onset, harvest.timeline, harvest.buckling)
@@ -328,10 +328,10 @@ def _timeline(harvest: Harvest, summary: Summary) -> Section:
 
 
 def _gauge_cards(summary: Summary, states: Sequence[PhotographState]) -> list[Card]:
-    """What gauges read, and where they are on the last photograph that has a whole displacement."""
+    """Readings of gauges; their places, if the last photograph shown has a whole displacement."""
     rows, placed = summary.get("gauges", ()), None
     read = {row["image"] for row in rows}
-    # In a harvest compression is positive, in what gauges read tension.
+    # Strains of photographs are positive in compression, those of gauges in tension.
     strains = {f["name"]: -f["strain_x"] for f in summary["frames"] if f["name"] in read}
     if rows and states and (whole := states[-1].frame.whole):
         image, gauges = states[-1].frame.image, states[-1].harvest.case.gauges
@@ -340,7 +340,7 @@ def _gauge_cards(summary: Summary, states: Sequence[PhotographState]) -> list[Ca
 
 
 def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
-    """Tables of all photographs, and of the modes in those that are shown."""
+    """Table of all photographs; tables of the whole displacement and modes of those ``shown``."""
     return [
         *Card.tabular(ReportTable.of("frames", map(_frame_numbers, summary["frames"])), wide=True),
         *whole_cards([(names[f["name"]], f["whole_field"]) for f in shown if f.get("whole_field")]),
@@ -352,7 +352,7 @@ def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, s
 
 
 def _frame_numbers(frame: Frame) -> dict[str, Cell]:
-    """A photograph's row in the table of all."""
+    """A photograph's row in the table of all photographs."""
     modes, errors, local = frame["modes"], frame["errors_px"], frame["local"] or {}
     noise, model = ((errors[cause] or {}).get("fluctuation") for cause in ("noise", "model_error"))
     return {
@@ -383,7 +383,7 @@ def _amplitude_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[
 
 
 def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
-    """For each mode its parameters in each of these frames, with both standard errors."""
+    """Tables of each mode's parameters in all these photographs, with both standard errors."""
     cards = []
     for i in range(max((len(frame["modes"]) for frame in frames), default=0)):
         of = [frame for frame in frames if i < len(frame["modes"])]
@@ -415,7 +415,7 @@ def _known(*errors: float | None) -> tuple[float, ...]:
 
 
 def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
-    """Wave vectors of all modes in these frames, with both standard errors."""
+    """Table of the wave vectors of all modes in these photographs, with both standard errors."""
     rows: list[dict[str, Cell]] = []
     for frame in frames:
         for i, mode in enumerate(frame["modes"], start=1):
@@ -430,7 +430,7 @@ def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]
 
 
 def _contour_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
-    """Modes by speckle and by contours, and their differences over the standard deviations."""
+    """Table of modes by speckle and by contours; differences in standard deviations."""
     rows: list[dict[str, Cell]] = [
         {**row, "photograph": names[frame["name"]] if k == 0 else "",
          "what": f"{row['what']} of φ{row['mode']}",
@@ -445,13 +445,13 @@ def _contour_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Ca
 
 
 def notes(summary: Summary) -> list[str]:
-    """What a reader should know before trusting the numbers."""
+    """Notes on the conditions and limits of the numbers, made from the data."""
     text = []
     for frame in summary["frames"]:
         at = f"{frame['name']}, {percent(frame['strain'])}:"
         if frame["outcome"] != "converged":
             text.append(f"{at} {outcome_text(frame)}")
-        text += [f"{at} {frame['residual_test']}", f"{at} {_capitalised(frame['weighting'])}"]
+        text += [f"{at} {frame['residual_test']}", f"{at} {_full_stop(frame['weighting'])}"]
     noise, by = summary["noise"], "photographs"
     if summary["frames"][-1]["shown"] == "contours":
         by = "contours"
@@ -464,5 +464,5 @@ def notes(summary: Summary) -> list[str]:
     return text
 
 
-def _capitalised(text: str) -> str:
+def _full_stop(text: str) -> str:
     return text if text.endswith(".") else f"{text}."

@@ -50,12 +50,8 @@ from modeharvest.idic.photograph.displacement import (
 )
 from modeharvest.idic.photograph.gauges import points_of, read_gauges, reading_rows, write_gauges
 from modeharvest.idic.photograph.material import find_material
-from modeharvest.idic.photograph.plain import (
-    MaterialContours,
-    displacement_of_plain,
-    plain_surface,
-    write_shapes,
-)
+from modeharvest.idic.photograph.plain.measure import displacement_of_plain, write_shapes
+from modeharvest.idic.photograph.plain.surface import MaterialContours, plain_surface
 from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate

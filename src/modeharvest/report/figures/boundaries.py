@@ -44,7 +44,7 @@ class MeshBoundary:
         return cls(mesh.nodes, tuple(loops))
 
     def path(self, displacement: FloatArray | None = None) -> Path:
-        """The boundary, displaced by (n, 2) at the mesh's nodes [mm]; holes stay open when filled.
+        """Path of the boundary, displaced by nodal values (n, 2) [mm]; holes aren't filled.
 
         A quadratic edge is a parabola, which a Bezier curve of second order draws exactly.
         """
@@ -66,20 +66,20 @@ class MeshBoundary:
 
 
 CELLS = 900
-"""Along the mask's longer side, at most about that many cells; a boundary needs no more."""
-_TOLERANCE = 0.3  # cells that corners may be off, once straight runs have become one edge
+"""Approximate limit on the cells along a mask's longer side, for tracing its boundary."""
+_TOLERANCE = 0.3  # largest deviation of the simplified polygon from the traced contour [cells]
 
 
 def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> MeshBoundary:
-    """Follow the edge of a mask.
+    """Trace the boundary of a mask.
 
-    ``mask``: (rows, cols) True on material. ``grid``: its pixels. ``least``: area [mm²] below which
-    holes and islands are left out, as specks.
-    The boundary is off the mask's edge by at most about a third of a cell; empty for an empty mask.
+    ``mask``: (rows, cols) True on material. ``grid``: its pixels. ``least``: holes and islands of
+    at most this area [mm²] are left out. The boundary deviates from the mask's edge by at most
+    about a third of a cell, and is empty for an empty mask.
     """
     factor = max(1, round(max(grid.shape) / CELLS))
     cells = grid.binned(factor)
-    # Padded, or what touches the image's edge would stay open.
+    # Padding closes the contours of material that touches the image's edge.
     cover = np.pad(block_means(mask, factor), 1)
     nodes: list[FloatArray] = [np.empty((0, 2))]
     loops, count = [], 0
@@ -98,41 +98,41 @@ def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> MeshB
 
 
 def block_means(field: NDArray[Any], side: int) -> FloatArray:
-    """Averages over blocks of side × side pixels; incomplete blocks are dropped."""
+    """Means over blocks of ``side`` x ``side`` pixels; incomplete blocks are dropped."""
     rows, cols = (size // side for size in field.shape)
-    # Rows first, which is several times faster.
+    # Summing over rows first is several times faster.
     whole = field[: rows * side].reshape(rows, side, -1).sum(axis=1, dtype=np.float64)
     return np.asarray(whole[:, : cols * side].reshape(rows, cols, side).sum(axis=2) / side**2)
 
 
-_SPARE = 0.15  # of the window: how much further the copies reach, for what a deformation brings in
+_SPARE = 0.15  # margin of copies around a window, over its size: a deformation moves some into it
 
 
 @dataclass(frozen=True, eq=False)
 class LatticePatch:
-    """Copies of a cell, joined where they touch."""
+    """Copies of a unit cell, joined at common nodes."""
 
     mesh: Mesh
-    """Of all copies together, undeformed [mm]."""
+    """Undeformed mesh of all copies [mm]."""
     boundary: MeshBoundary
-    """Holes and the ragged outer edge, which the window cuts off."""
+    """Boundary of the holes, and the outer boundary, which is outside the window."""
     lattice: FloatArray
     """(2, 2) lattice vectors of the cell as rows [mm]."""
     node: IntArray
     copy: IntArray
-    """(N,) which node of the cell each node is, and (N, 2) in which copy."""
+    """(N,) index of each node in the cell, and (N, 2) lattice indices of its copy of the cell."""
     centre: FloatArray
     """(2,) middle of the cell and of the window [mm]."""
     window: FloatArray
-    """(2,) width and height [mm]."""
+    """(2,) width and height of the window [mm]."""
 
     @classmethod
     def of(cls, mesh: Mesh, lattice: FloatArray, window: tuple[float, float]) -> LatticePatch:
-        """Fill a window [mm] about the middle of a periodic cell with copies of it."""
+        """Fill a window (width, height) [mm] around a periodic cell's middle with its copies."""
         lattice, size = np.asarray(lattice, dtype=np.float64), np.asarray(window)
         found = find_periodicity(mesh, lattice)
         copies = _cells_in_window(mesh, lattice, size)
-        # A node of the lattice: its master's number, and the copy the master would be in.
+        # A node of the lattice is identified by its master and the master's copy of the cell.
         shifts = (copies[:, None] + found.shift).reshape(-1, 2)
         names = np.column_stack([shifts, np.tile(found.master, len(copies))])
         _, first, number = np.unique(names, axis=0, return_index=True, return_inverse=True)
@@ -151,16 +151,16 @@ class LatticePatch:
 
     @property
     def cell_corners(self) -> FloatArray:
-        """(4, 2) corners of the parallelogram of the lattice vectors about the middle [mm]."""
+        """(4, 2) corners of the lattice vectors' parallelogram around the middle [mm]."""
         a1, a2 = self.lattice
         return np.array([self.centre + 0.5 * (s * a1 + t * a2)
                          for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))])  # fmt: skip
 
     def moved(self, values: FloatArray, gradient: FloatArray | None = None) -> FloatArray:
-        """(N, 2) displacement of all copies from the cell's, the window's middle staying.
+        """(N, 2) displacement of all copies [mm]; its affine part is zero at the window's middle.
 
-        ``values``: (n, 2) displacement of the cell's nodes [mm]: periodic but for the affine part.
-        ``gradient``: (2, 2) F̄ of the affine part [-]; None for a periodic field.
+        ``values``: (n, 2) displacement of the cell's nodes [mm], periodic except for its affine
+        part. ``gradient``: (2, 2) F̄ of the affine part [-]; None for a periodic displacement.
         """
         if gradient is None:
             return np.asarray(values[self.node])
@@ -170,7 +170,7 @@ class LatticePatch:
 
 
 def _cells_in_window(mesh: Mesh, lattice: FloatArray, window: FloatArray) -> IntArray:
-    """(c, 2) the copies whose bounding box meets the window, with some to spare."""
+    """(c, 2) lattice indices of copies whose bounding box meets the window with its margin."""
     half = 0.5 * (window + np.ptp(mesh.nodes, axis=0)) + _SPARE * window
     inverse = np.linalg.inv(lattice)
     corners = np.array([[s, t] for s, t in product((-1, 1), repeat=2)]) * half @ inverse

@@ -24,9 +24,9 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.onset import Buckling, ImageAmplitude
 
 CURVE, SMALL, WIDE = (5.2, 3.3), (4.6, 2.7), (9.6, 3.0)
-"""Sizes of pictures of curves [in]."""
+"""Width and height of figures with curves [in]."""
 DASHES = (0, (3, 2))
-EIGENVALUES = 4  # curves of them
+EIGENVALUES = 4  # number of curves
 _LOAD, _LOWEST = "reaction_N_per_mm", "lowest_eigenvalues_N_per_mm4"
 _LEVELS = (GOLD, GREEN, RED, BLUE)
 
@@ -34,7 +34,7 @@ _LEVELS = (GOLD, GREEN, RED, BLUE)
 def draw_load(path: Mapping[str, Any], critical: float | None) -> Figure:
     """Draw compressive force over nominal strain, unstable states dashed.
 
-    ``path``: ``Solution.info["path"]``: for each branch, lists over its states. ``critical``:
+    ``path``: ``Solution.info["path"]``, for each branch lists over its states. ``critical``:
     critical strain [-], None if there is none.
     """
     drawn, axes = curve("nominal strain [%]", "force per thickness [N/mm]")
@@ -71,7 +71,7 @@ def _draw_branch(
     branching: float,
     below: float,
 ) -> None:
-    """A buckled branch, from the critical point on; its name this far below its end [pt]."""
+    """Draw a buckled branch from the critical point on, its label ``below`` its end [pt]."""
     strain, load = _path_column(branch, "nominal_strain"), _path_column(branch, _LOAD)
     if not strain.size:
         return
@@ -113,7 +113,7 @@ def draw_eigenvalues(path: Mapping[str, Any], critical: Mapping[str, Any] | None
 
 
 def _draw_critical(axes: Axes, at: float, height: float, shift: tuple[float, float]) -> None:
-    """A ring at the critical strain [%], its value beside."""
+    """Draw a ring at the critical strain ``at`` [%], and its value beside it."""
     ring(axes, at, height)
     annotate(axes, at, height, f"critical, {at:.3f} %", INK, shift, "right")
 
@@ -123,7 +123,7 @@ def _path_column(branch: Mapping[str, Any], name: str) -> FloatArray:
 
 
 def _ladder(branch: Mapping[str, Any]) -> FloatArray:
-    """(states, EIGENVALUES) with NaN where fewer were computed."""
+    """(states, EIGENVALUES) lowest eigenvalues [N/mm⁴], NaN where fewer were computed."""
     lists = branch.get(_LOWEST, [])
     ladder = np.full((len(lists), EIGENVALUES), np.nan)
     for row, values in zip(ladder, lists, strict=True):
@@ -132,7 +132,7 @@ def _ladder(branch: Mapping[str, Any]) -> FloatArray:
 
 
 def pattern_density(spectrum: Spectrum, pattern: WavePattern) -> float:
-    """The larger of S_xx and S_yy at the pattern's wave vectors [mm⁶]; 0 without a pattern."""
+    """Largest of S_xx and S_yy at the pattern's wave vectors [mm⁶]; 0 without a pattern."""
     peaks = [np.abs(spectrum.at(wave.xi)) ** 2 for wave in pattern.waves]
     return float(np.max(peaks, initial=0.0))
 
@@ -140,8 +140,8 @@ def pattern_density(spectrum: Spectrum, pattern: WavePattern) -> float:
 def draw_density(spectrum: Spectrum, pattern: WavePattern, component: int, end: float) -> Figure:
     """Draw S_xx (component 0) or S_yy (1) with the pattern's wave vectors ringed.
 
-    The colours end at ``end`` [mm⁶]; meant is the pattern's own density, so that it is seen
-    beside the lines that the specimen's edges leave on the axes. If 0, the largest peak's.
+    The colours end at ``end`` [mm⁶], usually the pattern's density: larger densities on the axes
+    are due to the specimen's edges. If ``end`` is 0, they end at the largest peak off the axes.
     """
     drawn, axes = wave_plane(1.0, 0.5, (0.17, 0.165, 0.59, 0.70), 0.84)
     xi1, xi2, both = spectrum.window(1.0)
@@ -164,9 +164,9 @@ def draw_density(spectrum: Spectrum, pattern: WavePattern, component: int, end: 
 def wave_plane(
     half: float, step: float, box: tuple[float, float, float, float], tall: float
 ) -> tuple[Figure, Axes]:
-    """Empty axes for wave vectors within ± half [1/l], with a tick at each step.
+    """Make empty axes for wave vectors within ± ``half`` [1/l], with a tick at each ``step`` [1/l].
 
-    ``box``: of the axes in the figure, whose height is ``tall`` times its width.
+    ``box``: left, bottom, width and height of the axes [-]; ``tall``: the figure's height/width.
     """
     drawn = style.figure(WIDTH, WIDTH * tall)
     axes = drawn.add_axes(box)
@@ -178,7 +178,7 @@ def wave_plane(
 
 
 def draw_convergence(result: Result) -> Figure:
-    """Draw the size of each Gauss-Newton step; each level of the pyramid in its colour."""
+    """Draw the rms of each Gauss-Newton step [px], with a colour for each level of the pyramid."""
     drawn, axes = curve("iteration", "step, rms [px]")
     history = result.history
     firsts = [k for k, step in enumerate(history) if step.number == 1 or k == 0]
@@ -195,7 +195,7 @@ def draw_convergence(result: Result) -> Figure:
                       fontsize=7, color=colour, annotation_clip=False)  # fmt: skip
     if any(step.step_px > 0 for step in history):
         axes.set_yscale("log")
-        axes.yaxis.set_minor_locator(NullLocator())  # half the time of the picture
+        axes.yaxis.set_minor_locator(NullLocator())  # they take half the drawing time
         plain_ticks(axes.yaxis)
     axes.set_xlim(0.5, max(1, len(history)) + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -205,7 +205,7 @@ def draw_convergence(result: Result) -> Figure:
 def curve(
     x: str, y: str, size: tuple[float, float] = CURVE, *, below: float = 0.46
 ) -> tuple[Figure, Axes]:
-    """An empty picture of a size [in] for curves, with these labels and room below [in]."""
+    """Make an empty figure of a ``size`` [in] for curves, with room ``below`` the axes [in]."""
     width, height = size
     drawn = style.figure(width, height)
     box = (0.57 / width, below / height, 1.0 - 0.67 / width, 1.0 - (below + 0.2) / height)
@@ -217,7 +217,7 @@ def curve(
 
 
 def legend_above(axes: Axes, columns: int = 4) -> None:
-    """Names above the picture, where no curve is."""
+    """Put the legend above the axes, where no curve is."""
     if axes.get_legend_handles_labels()[0]:
         made = axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
                            handlelength=1.6, columnspacing=1.2, borderaxespad=0.1)  # fmt: skip
@@ -226,7 +226,7 @@ def legend_above(axes: Axes, columns: int = 4) -> None:
 
 
 def plain_ticks(*axes: Axis) -> None:
-    """Write 20 rather than 2 x 10^1 on logarithmic axes, and raised powers without mathtext."""
+    """Label logarithmic axes with 20 rather than 2 x 10^1, and powers of ten without mathtext."""
     for axis in axes:
         axis.set_major_formatter(FuncFormatter(_plain))
         axis.set_minor_formatter(FuncFormatter(_plain))
@@ -243,21 +243,21 @@ def _plain(value: float, _: object) -> str:
 def annotate(
     axes: Axes, x: float, y: float, text: str, colour: str, shift: tuple[float, float], side: str
 ) -> None:
-    """Write beside a point: shifted [pt], its ``side`` there."""
+    """Write text beside a point: its ``side`` is at the point shifted by ``shift`` [pt]."""
     axes.annotate(text, (x, y), shift, textcoords="offset points", ha=side, color=colour,
                   fontsize=7.5)  # fmt: skip
 
 
 def ring(axes: Axes, x: float, y: float) -> None:
-    """Mark a critical point."""
+    """Mark a critical point by a ring."""
     axes.plot([x], [y], "o", ms=8, mfc="none", mec=INK, mew=1.2, clip_on=False)
 
 
 def draw_onset(moments: Sequence[ImageAmplitude], buckling: Buckling | None) -> Figure:
-    """Draw the pattern's amplitude over the strain, above what it has to stand out of.
+    """Draw the pattern's amplitude over strain, and the limits above which it is observable.
 
-    ``moments``: in the order of the test, with at least one. ``buckling``: when the pattern
-    appeared.
+    ``moments``: amplitudes in the order of the test, at least one. ``buckling``: onset of the
+    pattern, None if unknown.
     """
     drawn, axes = curve("nominal strain [%]", "pattern v₁φ₁, rms [px]")
     strain, size, model, noise = np.array(
@@ -284,10 +284,10 @@ def draw_onset(moments: Sequence[ImageAmplitude], buckling: Buckling | None) -> 
 
 
 def draw_waves(frames: Sequence[dict[str, Any]]) -> Figure:
-    """Draw the lengths of the wave vectors' components over the strain.
+    """Draw the absolute values of the wave vectors' components over the strain.
 
-    ``frames``: of ``summary.json``, those that have modes; error bars are two standard deviations
-    by the larger of noise and model error.
+    ``frames``: those of ``summary.json`` with modes. Error bars: two standard deviations, by noise
+    or model error, whichever is larger. Filled markers: free and observable parameters.
     """
     drawn, axes = curve("nominal strain [%]", "components of the wave vectors, |ξ| [1/l]")
     for number, (label, points) in enumerate(_components(frames).items()):
@@ -300,7 +300,7 @@ def draw_waves(frames: Sequence[dict[str, Any]]) -> Figure:
             chosen = (free > 0) == is_free
             axes.plot(strain[chosen], value[chosen], marker, color=colour, ms=4.5, label=label,
                       mfc=colour if is_free else "none")  # fmt: skip
-            label = "_"  # in the legend once
+            label = "_"  # once in the legend
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.margins(y=0.25)
     axes.legend(loc="best", ncols=2)
@@ -308,7 +308,7 @@ def draw_waves(frames: Sequence[dict[str, Any]]) -> Figure:
 
 
 def _components(frames: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float, ...]]]:
-    """For each component of each wave: strain [%], length, standard deviation, 1 if free."""
+    """For each component of each wave: strain [%], |ξ| and sd [1/l], 1 if free and observable."""
     found: dict[str, list[tuple[float, ...]]] = {}
     for frame in frames:
         for i, mode in enumerate(frame["modes"], start=1):
@@ -325,7 +325,7 @@ def _components(frames: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float,
 
 
 def _band(axes: Axes, strain: FloatArray, top: FloatArray, colour: str, name: str) -> None:
-    """What lies below ``top``, carried on beyond the first and the last photograph."""
+    """Shade the area below ``top``, extended beyond the first and the last photograph."""
     ends = [min(0.0, strain[0]), 2.0 * strain[-1] - min(0.0, strain[0]) + 1.0]
     strain = np.concatenate([ends[:1], strain, ends[1:]])
     top = np.concatenate([top[:1], top, top[-1:]])
@@ -336,7 +336,7 @@ def _band(axes: Axes, strain: FloatArray, top: FloatArray, colour: str, name: st
 def _mark_onset(
     axes: Axes, buckling: Buckling, strain: FloatArray, size: FloatArray, top: float
 ) -> None:
-    """The strains between which the pattern appears, and where its growth points back to."""
+    """Mark the strains between which the pattern appears, and the extrapolated critical strain."""
     if np.isfinite(buckling.before) and np.isfinite(buckling.after):
         axes.axvspan(100 * buckling.before, 100 * buckling.after, color=RED, alpha=0.08, lw=0)
         middle = 50 * (buckling.before + buckling.after)

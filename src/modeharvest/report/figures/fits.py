@@ -1,7 +1,7 @@
-"""Maps of what was fitted to an image, the same for virtual experiments and for photographs.
+"""Maps of the ansatz fitted to an image, the same for virtual experiments and for photographs.
 
-A quantity is a :class:`Panel`: drawn for every state, its pictures side by side. Those of the
-ansatz are listed here; the others where their kind of run is.
+A quantity is a :class:`Panel`, drawn for every state, side by side. Panels of the ansatz are
+defined here, others in the report of each kind of run.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from modeharvest.report.model import Card, ReportFigure, Section, caption
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 FINE, SMOOTH, COARSE = 740, 360, 160
-"""Cells along a map's longer side: as fine as speckles, as patterns, as error bars."""
+"""Cells along a map's longer side, for fields that vary like speckle, patterns, error bars."""
 DRAWN_SHAPE = 0.16
-"""Largest displacement that modes are drawn with [l]."""
+"""Largest displacement of a drawn mode [l]."""
 UM = 1e3  # micrometres in a millimetre
 
 
 @dataclass(frozen=True, eq=False)
 class SpecimenView:
-    """The specimen that the maps of all states are drawn on."""
+    """The specimen on which the maps of all states are drawn."""
 
     boundary: MeshBoundary
-    """Of the material in the reference."""
+    """Boundary of the material in the reference."""
     grid: PixelGrid
     mask: BoolArray
-    """The images' pixels, and (rows, cols) which of the reference's show material."""
+    """Pixels of the images, and mask (rows, cols) of the reference, True on material."""
     pitch: float
     """Unit cell size l [mm]."""
 
     def map_frame(self, cells: int = SMOOTH) -> MapFrame:
-        """The frame of maps with about that many cells along the longer side."""
+        """Frame of maps with about ``cells`` cells along the longer side."""
         return MapFrame.of(self.boundary, self.grid, cells)
 
     def on_material(self, values: FloatArray, cells: int = SMOOTH) -> FloatArray:
-        """Values on a map; NaN off the material, where the ansatz has no meaning."""
+        """Values on a map; NaN in cells without material, where the ansatz has no meaning."""
         map_frame = self.map_frame(cells)
         (rows, cols), n = map_frame.grid.shape, map_frame.factor
         blocks = self.mask[: rows * n, : cols * n].reshape(rows, n, cols, n)
@@ -66,19 +66,19 @@ class SpecimenView:
 
 @dataclass(frozen=True, eq=False)
 class FittedState:
-    """A deformed state and what was fitted to its image."""
+    """A deformed state and the ansatz fitted to its image."""
 
     name: str
     label: str
-    """Ending of its pictures' anchors, and what is written above them."""
+    """Last part of the anchors of the state's figures, and the label above them."""
     view: SpecimenView
     result: Result
     densities: Callable[[], tuple[Spectrum, WavePattern, float]]
-    """Gives the spectral densities of the displacement, what is read off them, and where their
-    colours end [mm⁶], the same for all states."""
+    """Returns the spectrum of the displacement, the pattern found in it, and the density at which
+    the colours end [mm⁶], which is the same for all states."""
 
     def motion(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """The measured displacement [mm]."""
+        """(..., 2) measured displacement [mm] at positions x, y [mm] that broadcast together."""
         return self.result.ansatz.displacement(self.result.unknowns, x, y)
 
     def support(self, i: int, cells: int = SMOOTH) -> FloatArray:
@@ -87,21 +87,21 @@ class FittedState:
         return np.asarray(taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :])
 
     def shape_scale(self, i: int) -> float:
-        """By how much phi_i is drawn [mm], for a largest displacement of DRAWN_SHAPE l."""
+        """Factor [mm] by which phi_i is drawn, for a largest displacement of DRAWN_SHAPE l."""
         phi = self.result.phi(i, self.view.map_frame().grid)
         largest = float(np.linalg.norm(phi, axis=-1).max())
         return DRAWN_SHAPE * self.view.pitch / largest if largest > 0 else 1.0
 
 
 def convergence_card(state: FittedState, caption: str = "") -> Card:
-    """The steps of a state's correlation."""
+    """Make a card with the Gauss-Newton steps of a state's correlation."""
     drawn = partial(draw_convergence, state.result)
     figure = ReportFigure(f"convergence-{state.name}", "", drawn, wide=True)
     return Card(state.label, [figure], caption=caption)
 
 
 def largest_density(spectra: Iterable[tuple[Spectrum, WavePattern]]) -> float:
-    """Of any state's pattern [mm⁶]; 0 without."""
+    """Largest spectral density of any state's pattern [mm⁶]; 0 if there is no pattern."""
     return max((pattern_density(*pair) for pair in spectra), default=0.0)
 
 
@@ -109,7 +109,7 @@ S = TypeVar("S", bound=FittedState, contravariant=True)
 
 
 def always(state: FittedState) -> bool:
-    """For every state."""
+    """Return True for every state."""
     return True
 
 
@@ -119,30 +119,30 @@ class Panel(Generic[S]):
 
     section: str
     key: str
-    """Where on the page it is, and its anchor there."""
+    """Name of the section on the page, and anchor of the panel."""
     draw: Callable[[S], Figure]
     shows: Callable[[S], bool] = always
-    """Whether there is something to draw."""
+    """Whether the quantity exists for a state."""
     text: str = ""
-    """The name of its words; by default the key."""
+    """Name of the panel's texts in ``captions.toml``; by default the key."""
     figure: str = "-"
-    """In the paper; empty for none."""
+    """Number of the figure in the paper, if its texts need it; empty if it isn't in the paper."""
     exact: bool = False
-    """Whether the picture's pixels are kept exactly."""
+    """Whether the figure's pixels are stored without loss."""
     late: bool = False
-    """Whether what it shows may still be computed meanwhile."""
+    """Whether the figures are drawn after the others, because their data may not be ready."""
     values: Mapping[str, object] = field(default_factory=dict)
-    """What is filled into its words."""
+    """Values filled into the panel's texts."""
 
     @property
     def words(self) -> dict[str, Any]:
-        """Its title, symbol, panel in the paper, and caption."""
+        """Title, symbol, figure in the paper, and caption."""
         words = caption(self.text or self.key, figure=self.figure, **self.values)
         paper = f"paper: Fig. {words['paper']}" if self.figure and "paper" in words else ""
         return {**words, "paper": paper}
 
     def card(self, states: Sequence[S], numbers: Callable[[str, S], str]) -> Card:
-        """Its pictures of these states; ``numbers`` makes the lines below them."""
+        """Make a card with a figure of each state; ``numbers`` returns the line below it."""
         figures = [
             ReportFigure(f"{self.key}-{state.name}", state.label, partial(self.draw, state),
                          numbers(self.key, state), exact=self.exact, late=self.late)
@@ -158,10 +158,10 @@ def panel_sections(
     numbers: Callable[[str, S], str],
     **values: object,
 ) -> list[Section]:
-    """Sections of these names with their panels that have a picture.
+    """Make the sections ``names``, each with those of its panels that have a figure.
 
-    ``numbers`` makes the line below the picture of a panel's key and a state; ``values`` are filled
-    into the sections' words.
+    ``numbers``: returns the line below a figure from the panel's key and the state; ``values``:
+    filled into the sections' texts.
     """
     cards: dict[str, list[Card]] = {name: [] for name in names}
     for panel in panels:
@@ -174,7 +174,7 @@ def panel_sections(
 def draw_length(
     state: FittedState, length: FloatArray, cells: int = SMOOTH, share: float = 0.998
 ) -> Figure:
-    """Draw a length [mm] on a map in the deformed configuration, colours up to this share."""
+    """Draw lengths (rows, cols) [mm], deformed; ``share``: quantile at which the colours end."""
     scale = ColourScale.size(UM * length, "µm", share)
     return draw_field(state.view.map_frame(cells), UM * length, scale, state.motion)
 
@@ -182,7 +182,7 @@ def draw_length(
 def draw_dissolving(
     state: FittedState, image: NDArray[np.float32], material: BoolArray | None, length: FloatArray
 ) -> Figure:
-    """Let a state's image dissolve into the length [µm] of what was measured in it.
+    """Draw a state's image that fades, from left to right, into lengths (rows, cols) [µm].
 
     ``image``, ``material``: as for :func:`~modeharvest.report.figures.maps.draw_image`.
     """
@@ -204,7 +204,7 @@ def _v0(state: FittedState, component: int) -> Figure:
 
 
 def _amplitude(state: FittedState, i: int) -> Figure:
-    """v_i where phi_i is not zero; the colours end at the largest value where it is whole."""
+    """Draw v_i where the taper is above 0; the colours end at its largest size where it is 1."""
     support = state.support(i)
     v = UM * state.result.v(i, state.view.map_frame().grid)
     inside = state.view.on_material(np.where(support == 1.0, v, np.nan))
@@ -228,9 +228,9 @@ def _fluctuation(state: FittedState, i: int, component: int) -> Figure:
 def spectrum_panels(
     section: str, figure: str, states: str, shows: Callable[[S], bool]
 ) -> list[Panel[S]]:
-    """Both spectral densities; ``states`` is what the states are called.
+    """Make the panels of both spectral densities; ``states``: word for the states in captions.
 
-    ``figure``: the paper's; empty for patterns that aren't the paper's.
+    ``figure``: number of the figure in the paper; empty for patterns that aren't in the paper.
     """
     texts = {"Sxx": "Sxx", "Syy": "Syy" if figure else "Syy-other"}
     return [
@@ -241,7 +241,7 @@ def spectrum_panels(
 
 
 def ansatz_panels(section: str, figure: str, modes: int) -> list[Panel[FittedState]]:
-    """v0, and of each mode amplitude, shape and fluctuation."""
+    """Make the panels of v0, and of each mode's amplitude, shape and fluctuation."""
     text = "v0y" if figure else "v0y-other"
     panels: list[Panel[FittedState]] = [
         Panel(section, "v0x", partial(_v0, component=0), figure=figure),
@@ -264,7 +264,7 @@ def ansatz_panels(section: str, figure: str, modes: int) -> list[Panel[FittedSta
 
 
 def shape_numbers(key: str, state: FittedState) -> str:
-    """How the shape of a mode is drawn; empty for other panels."""
+    """Line below the shape of a mode that states its scale; empty for other panels."""
     if not key.startswith("phi"):
         return ""
     scale = state.shape_scale(int(key.removeprefix("phi")) - 1)
@@ -272,5 +272,5 @@ def shape_numbers(key: str, state: FittedState) -> str:
 
 
 def has_mode(i: int) -> Callable[[FittedState], bool]:
-    """Whether a state has mode i (from 0)."""
+    """Return a function that checks whether a state has mode i (from 0)."""
     return lambda state: i < len(state.result.ansatz.modes)

@@ -18,9 +18,9 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.elements import reference_element, shape_functions
 
 _FINE = 8
-"""Parts of an element's side that are drawn."""
+"""Number of parts into which an element's side is divided for drawing."""
 _WIDTH = 3.2
-_ROOM = 0.24  # above and below a map [in]
+_ROOM = 0.24  # margin above and below a map [in]
 
 
 def draw_response(
@@ -29,9 +29,9 @@ def draw_response(
 ) -> Figure:  # fmt: skip
     """Draw force or energy over nominal strain: direct simulation and homogenized states.
 
-    ``path``: ``Solution.info["path"]``, empty without a direct simulation, and its ``critical``
-    strain [-]; ``response``: the homogenized one as plain values; ``first_order``: its critical
-    strain without modes [-]; ``key``: of what is drawn, in a state.
+    ``path``: ``Solution.info["path"]`` of a direct simulation, empty without one; ``critical``: its
+    critical strain [-]; ``response``: homogenized response as plain values; ``first_order``: its
+    critical strain without modes [-]; ``key``: "force_N_per_mm" or "energy_N".
     """
     drawn, axes = curve("nominal strain [%]", label)
     of_path = {"force_N_per_mm": "reaction_N_per_mm", "energy_N": "energy_N"}[key]
@@ -67,9 +67,9 @@ def draw_response(
 def draw_amplitude(
     mesh: Mesh, displacement: FloatArray, values: FloatArray, scale: ColourScale
 ) -> Figure:
-    """Draw a nodal field (n,), NaN where there is none, on the deformed macroscopic mesh.
+    """Draw a nodal field (n,), blank where it is NaN, on the deformed macroscopic mesh.
 
-    ``displacement``: (n, 2) [mm].
+    ``displacement``: (n, 2) nodal displacement [mm].
     """
     at = mesh.nodes + displacement
     margin = 0.012 * float(np.ptp(at, axis=0).max())
@@ -100,7 +100,7 @@ def draw_microstructure(rve: Mesh, displacement: FloatArray) -> Figure:
 
 
 def _within(mesh: Mesh, nodal: FloatArray) -> FloatArray:
-    """(c, f, p, p) nodal values (n, f) on a grid over each element, up to its sides."""
+    """(c, f, p, p) values interpolated from nodal ones (n, f) to a grid over each element."""
     t, reference = np.linspace(0.0, 1.0, _FINE + 1), reference_element(mesh.element)
     a, b = np.meshgrid(t, t, indexing="ij")
     xi = [a, b * (1.0 - a)] if reference.triangular else [2.0 * a - 1.0, 2.0 * b - 1.0]

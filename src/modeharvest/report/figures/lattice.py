@@ -30,20 +30,20 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.lattice import ModeRow
 
 _MARGIN, _ABOVE = 0.24, 0.03  # below a window, for the scale bar, and above it [in]
-_EMBER = LinearSegmentedColormap.from_list(  # seen on a dark page from the first value on
+_EMBER = LinearSegmentedColormap.from_list(  # even the lowest values are visible on a dark page
     "ember", np.vstack([to_rgba_array("#46506a"), style.GLOW(np.linspace(0.3, 1.0, 16))])
 )
-_BRIGHT = LinearSegmentedColormap.from_list(  # of densities, seen on their own background
+_BRIGHT = LinearSegmentedColormap.from_list(  # for densities, visible on the plot's background
     "bright", DENSITY(np.linspace(0.28, 1.0, 64))
 )
 _LOADS = LinearSegmentedColormap.from_list(
     "loads", to_rgba_array([BLUE, style.GREEN, style.GOLD, RED])
 )
-_SHIFTS = np.array(list(product(range(-2, 3), repeat=2)))  # to reciprocal vectors near zero
+_SHIFTS = np.array(list(product(range(-2, 3), repeat=2)))  # indices of reciprocal vectors near zero
 _PIXELS = 360  # along a zone map's side
-_NEAR = 2e-4  # turns: waves that near are the same
+_NEAR = 2e-4  # difference of phases below which waves are the same [turns]
 _UNIT = "N/mm⁴"
-_FLOOR = -40.0  # dB below the largest density that are shown
+_FLOOR = -40.0  # lowest density that is shown, relative to the largest [dB]
 _DARK, _LIGHT = "#16191d", "#ffffff"
 
 
@@ -53,11 +53,11 @@ def draw_lattice(
     displacement: FloatArray | None = None,
     gradient: FloatArray | None = None,
 ) -> Figure:
-    """Draw the lattice where it is, or where a displacement takes it, with its cell's boundary.
+    """Draw the undeformed or deformed lattice, with the parallelogram of one cell.
 
     ``patch``: copies of the cell, and the window. ``pitch``: unit cell size l [mm], for the scale
     bar. ``displacement``: (n, 2) of the cell's nodes [mm]; None for the undeformed lattice.
-    ``gradient``: (2, 2) F̄ of its affine part [-]; None for a periodic displacement.
+    ``gradient``: (2, 2) F̄ of the affine part [-]; None for a periodic displacement.
     """
     moved = None if displacement is None else patch.moved(displacement, gradient)
     F = np.eye(2) if gradient is None else np.asarray(gradient)
@@ -71,10 +71,10 @@ def draw_lattice(
 
 
 def draw_growth(patch: LatticePatch, shape: FloatArray, amplitude: float, pitch: float) -> Figure:
-    """Draw a mode whose amplitude rises from nothing on the left to all on the right.
+    """Draw a mode whose amplitude increases from zero on the left to the full value on the right.
 
-    No equilibrium: a picture of what the mode does. The colours are the displacement's length.
-    ``shape``: (n, 2) the mode at the cell's nodes [-]. ``amplitude``: largest displacement, at the
+    This illustrates the mode, and is no equilibrium. Colours show the displacement's length [l].
+    ``shape``: (n, 2) the mode at the cell's nodes [-]. ``amplitude``: largest displacement, on the
     right [mm]. ``pitch``: unit cell size l [mm].
     """
     largest = float(np.linalg.norm(shape, axis=1).max())
@@ -97,7 +97,7 @@ def draw_overlay(
 
     ``mesh``: a quarter of the mode's cell [mm]. ``pitch``: unit cell size l [mm]. ``numerical``,
     ``analytic``: (n, 2) both modes at its nodes, of equal norm over the material. ``largest``:
-    largest displacement of the numerical one, as drawn [mm].
+    largest displacement of the numerical mode as drawn [mm].
     """
     factor = largest / float(np.linalg.norm(numerical, axis=1).max())
     boundary = MeshBoundary.of(mesh)
@@ -120,7 +120,7 @@ def _window_axes(
     share: float = 0.98,
     above: float = _ABOVE,
 ) -> tuple[Figure, Axes]:
-    """Empty axes over the patch's window, with a scale bar of one cell."""
+    """Make empty axes for the patch's window, with a scale bar of one cell size."""
     drawn, axes = bare_axes(width, patch.window, share, _MARGIN, above)
     left, right, bottom, top = patch.limits
     axes.set(xlim=(left, right), ylim=(bottom, top))
@@ -131,10 +131,10 @@ def _window_axes(
 def draw_dispersion(
     dispersion: Dispersion, critical: Sequence[Wave] = (), load: LoadQuantity = STRAIN
 ) -> Figure:
-    """Draw the lowest eigenvalue along a path through the zone, at several loads.
+    """Draw the lowest eigenvalue along a path through the Brillouin zone, at several loads.
 
     ``dispersion``: eigenvalues; higher bands are drawn faintly. ``critical``: phases (k . a1, k .
-    a2) of the critical waves [rad], ringed where the path meets them.
+    a2) of the critical waves [rad], marked by rings where the path meets them.
     """
     distances, values = dispersion.distances, dispersion.eigenvalues
     order = np.argsort(dispersion.loads)
@@ -163,7 +163,7 @@ def draw_zone_map(zone: ZoneMap, pitch: float, critical: Sequence[Wave] = ()) ->
     """Draw the lowest eigenvalue over the plane of wave vectors, in Cartesian components.
 
     ``zone``: eigenvalues over one period. ``pitch``: l [mm]. ``critical``: phases (k . a1, k . a2)
-    of the critical waves [rad], ringed with all their images.
+    of the critical waves [rad], marked by rings together with all equivalent waves.
     """
     reciprocal = np.linalg.inv(zone.lattice).T * pitch  # rows b1, b2: a_i . b_j = l delta_ij
     corners = _first_zone(reciprocal)
@@ -193,8 +193,8 @@ def draw_lattice_spectrum(
 ) -> Figure:
     """Draw a density at the discrete wave vectors of a periodic field, in dB below the largest.
 
-    ``xi``: (n, 2) wave vectors [1/l]. ``density``: (n,) S_xx or S_yy [mm^6]. ``largest``: what 0 dB
-    is: the largest of both components [mm^6]. ``reach``: of the axes [1/l].
+    ``xi``: (n, 2) wave vectors [1/l]. ``density``: (n,) S_xx or S_yy [mm^6]. ``largest``: density
+    at 0 dB, the largest of S_xx and S_yy [mm^6]. ``reach``: largest component shown [1/l].
     """
     within = np.abs(xi).max(axis=1) <= reach + 1e-9
     xi, density = xi[within], density[within]
@@ -212,7 +212,7 @@ def draw_lattice_spectrum(
 
 
 def _plane(half: float) -> tuple[Figure, Axes]:
-    """Empty axes for wave vectors within ± half [1/l]."""
+    """Make empty axes for wave vectors within ± ``half`` [1/l]."""
     step = 0.5 if half < 1.6 else 1.0
     return curves.wave_plane(half, step, (0.17, 0.205, 0.59, 0.67), 0.88)
 
@@ -227,14 +227,14 @@ def _first_zone(reciprocal: FloatArray) -> FloatArray:
 
 
 def _images(critical: Sequence[Wave], reciprocal: FloatArray, half: float) -> FloatArray:
-    """(c, 2) all wave vectors within ± half that are the critical waves or their opposites."""
+    """(c, 2) wave vectors [1/l] within ± ``half`` equivalent to ± the critical waves."""
     turns = (_turns(critical)[:, None] + _SHIFTS).reshape(-1, 2)
     xi = np.unique(np.round(turns @ reciprocal, 9), axis=0)
     return np.asarray(xi[np.abs(xi).max(axis=1) <= half])
 
 
 def _zone_scale(values: FloatArray) -> ColourScale:
-    """Colours that diverge from zero where there is something below it."""
+    """Colours that diverge from zero if there are negative values, and else rise from it."""
     low, high = float(values.min()), float(values.max())
     if low < -1e-3 * high:
         end = max(-low, 0.05 * high)
@@ -245,13 +245,13 @@ def _zone_scale(values: FloatArray) -> ColourScale:
 
 
 def _on_path(waves: FloatArray, critical: Sequence[Wave]) -> NDArray[np.bool_]:
-    """(p,) which waves of a path are critical ones, or their opposites."""
+    """(p,) True for waves of a path that are equivalent to critical ones or their opposites."""
     off = np.asarray(waves)[:, None] / (2.0 * np.pi) - _turns(critical)
     return np.asarray((np.abs(off - np.rint(off)).max(axis=-1) < _NEAR).any(axis=1))
 
 
 def _turns(critical: Sequence[Wave]) -> FloatArray:
-    """(2c, 2) phases of the critical waves and their opposites, in turns."""
+    """(2c, 2) phases of the critical waves and their opposites [turns]."""
     phases = np.reshape(np.asarray(critical, dtype=np.float64), (-1, 2))
     return np.asarray(np.vstack([phases, -phases]) / (2.0 * np.pi), dtype=np.float64)
 
@@ -259,9 +259,9 @@ def _turns(critical: Sequence[Wave]) -> FloatArray:
 def draw_energies(
     branches: Sequence[Branch], critical: float | None, load: LoadQuantity = STRAIN
 ) -> Figure:
-    """Draw each branch's energy over that of the primary path at the same load.
+    """Draw each branch's energy minus that of the primary path at the same load [kPa].
 
-    ``branches``: those with states. ``critical``: critical load [-].
+    ``branches``: those without states are left out. ``critical``: critical load [-].
     """
 
     def above(branch: Branch) -> list[float]:
@@ -273,12 +273,12 @@ def draw_energies(
 def draw_amplitudes(
     branches: Sequence[Branch], critical: float | None, load: LoadQuantity = STRAIN
 ) -> Figure:
-    """Draw the size of the critical modes' amplitudes along each branch."""
+    """Draw the norm of the critical modes' amplitudes along each branch [mm]."""
     drawn = _branches(branches, critical, load, "amplitude, rms over the material [mm]", _size)
     axes = drawn.axes[0]
     for line, branch in zip(axes.lines[::3], (b for b in branches if b.states), strict=False):
         kept = [(size, s.load) for size, s in zip(_size(branch), branch.states, strict=True)]
-        points = np.vstack([branch.curve, kept])  # the branch is passed in finer steps
+        points = np.vstack([branch.curve, kept])  # the branch was followed in finer steps
         points = points[np.argsort(points[:, 0])]
         points = points[points[:, 0] <= max(kept)[0]]
         line.set_data(load.per_load * points[:, 1], points[:, 0])
@@ -286,7 +286,7 @@ def draw_amplitudes(
 
 
 def draw_differences(branches: Sequence[Branch], load: LoadQuantity = STRAIN) -> Figure:
-    """Draw each branch's energy over that of the lowest branch at the same load."""
+    """Draw each branch's energy minus that of the lowest branch at the same load [Pa]."""
     lowest: dict[float, float] = {}
     for state in (s for branch in branches for s in branch.states):
         lowest[state.load] = min(state.energy, lowest.get(state.load, np.inf))
@@ -335,7 +335,7 @@ def draw_overlaps(rows: Sequence[ModeRow]) -> Figure:
 
 
 def draw_captured(rows: Sequence[ModeRow]) -> Figure:
-    """Draw the energy that the automatically found family captures against d/l."""
+    """Draw the share of energy captured by the automatically found family, against d/l."""
     drawn = _over_ratio(rows, "energy in the automatic family [%]", lambda r: 100.0 * r.captured)
     for colour, _, series in _by_loading(rows):
         for row in series:
@@ -346,7 +346,7 @@ def draw_captured(rows: Sequence[ModeRow]) -> Figure:
 
 
 def draw_critical_strains(rows: Sequence[ModeRow]) -> Figure:
-    """Draw the first critical strain, and where it is not the pattern's, that one dashed."""
+    """Draw the first critical strain, and the pattern's own dashed, against d/l."""
     drawn = _over_ratio(
         rows, "critical strain [%]", lambda r: 100.0 * r.first if r.found else math.nan
     )
@@ -363,7 +363,7 @@ def draw_critical_strains(rows: Sequence[ModeRow]) -> Figure:
 
 
 def _over_ratio(rows: Sequence[ModeRow], label: str, value: Callable[[ModeRow], float]) -> Figure:
-    """A curve for each loading, with dots that are filled where the pattern buckles first."""
+    """Draw a curve for each loading, with dots that are filled where the pattern buckles first."""
     drawn, axes = curves.curve("hole diameter over cell size d/l [–]", label)
     for colour, loading, series in _by_loading(rows):
         ratios, heights = [row.ratio for row in series], [value(row) for row in series]
@@ -376,7 +376,7 @@ def _over_ratio(rows: Sequence[ModeRow], label: str, value: Callable[[ModeRow], 
 
 
 def _by_loading(rows: Sequence[ModeRow]) -> list[tuple[str, str, list[ModeRow]]]:
-    """Of each loading its colour, its name and its rows by d/l."""
+    """Colour, name and rows, sorted by d/l, of each loading."""
     loadings = dict.fromkeys(row.loading for row in rows)
     return [
         (colour, loading, sorted((r for r in rows if r.loading == loading), key=lambda r: r.ratio))

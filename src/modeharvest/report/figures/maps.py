@@ -32,18 +32,18 @@ DisplacementFunction = Callable[[FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class MapFrame:
-    """What all maps of a specimen share, so that they can be laid over each other."""
+    """Boundary, cells and limits common to all maps of a specimen, so that they can be overlaid."""
 
     boundary: MeshBoundary
     grid: PixelGrid
     factor: int
-    """The images' pixels, so many of them joined in each direction to the cells that are drawn."""
+    """Grid of the cells that are drawn, and number of image pixels along a cell's side."""
     limits: tuple[float, float, float, float]
     """(left, right, bottom, top) of every map [mm]."""
 
     @classmethod
     def of(cls, boundary: MeshBoundary, grid: PixelGrid, cells: int = 360) -> MapFrame:
-        """Make a frame for a boundary, with about that many cells along the longer side."""
+        """Make a frame of about ``cells`` cells along the longer side; ``grid``: image pixels."""
         factor = max(1, round(max(grid.shape) / cells))
         (left, bottom), (right, top) = boundary.nodes.min(axis=0), boundary.nodes.max(axis=0)
         margin = 0.012 * max(right - left, top - bottom)
@@ -51,19 +51,19 @@ class MapFrame:
         return cls(boundary, grid.binned(factor), factor, limits)
 
     def average(self, field: FloatArray) -> FloatArray:
-        """Average a field (rows, cols) of the images over the cells, NaN left out."""
+        """Average a field (rows, cols) on the images' pixels over the cells, without NaN."""
         known = np.isfinite(field)
         share = block_means(known, self.factor)
         mean = block_means(np.where(known, field, 0.0), self.factor)
         return np.divide(mean, share, out=np.full_like(mean, np.nan), where=share > 0)
 
     def sample(self, field: NDArray[Any]) -> NDArray[Any]:
-        """Take the middle pixel of each cell from a field (rows, cols) of the images."""
+        """Sample a field (rows, cols, ...) on the images' pixels at the middle of each cell."""
         return field[np.ix_(*self.pixels)]
 
     @property
     def pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows and columns of the images' pixels that are the middles of the cells."""
+        """Rows and columns of the images' pixels at the middles of the cells."""
         n = self.factor
         rows, cols = (n // 2 + n * np.arange(size) for size in self.grid.shape)
         return rows, cols
@@ -74,7 +74,7 @@ class MapFrame:
         return motion(x[:, None], y[:, None])[:, 0]
 
     def moved_corners(self, motion: DisplacementFunction | None) -> tuple[FloatArray, FloatArray]:
-        """(rows + 1, cols + 1) positions of the cells' corners [mm], none off the specimen."""
+        """(rows + 1, cols + 1) x and y of cells' corners, clipped to the mesh, displaced [mm]."""
         h = 0.5 * self.grid.pixel_size
         low, high = self.boundary.nodes.min(axis=0), self.boundary.nodes.max(axis=0)
         x = np.clip(np.append(self.grid.x - h, self.grid.x[-1] + h), low[0], high[0])
@@ -86,54 +86,54 @@ class MapFrame:
         return X + u[..., 0], Y + u[..., 1]
 
 
-_FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # four straight triangles in a T6
+_FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # the four straight triangles of a T6
 _STEPS = (1, 2, 2.5, 5, 10)
-WIDTH = 2.35  # of a map with its colour bar [in]
+WIDTH = 2.35  # width of a map with its colour bar [in]
 _MAP = 0.76  # the map's share of the width
-_BELOW, _ABOVE = 0.24, 0.22  # for the scale bar and the unit [in]
-_GAP, _BAR, _POINTED = 0.05, 0.072, 0.05  # before a colour bar, its width, its pointed ends [in]
+_BELOW, _ABOVE = 0.24, 0.22  # heights for the scale bar and the unit [in]
+_GAP, _BAR, _POINTED = 0.05, 0.072, 0.05  # gap to a colour bar, its width, length of its tips [in]
 
 
 @dataclass(frozen=True)
 class ColourScale:
-    """Colours for values."""
+    """A mapping from values to colours."""
 
     colours: Colormap
     low: float
     high: float
     """Ends of the colour map, in ``unit``."""
     unit: str = ""
-    """Written above the colour bar; empty for a number without one."""
+    """Unit, written above the colour bar; empty for dimensionless values."""
     extend: str = "neither"
     """Whether values lie beyond the ends: "neither", "min", "max" or "both"."""
     is_log: bool = False
-    """For values of many orders of magnitude."""
+    """Whether the scale is logarithmic."""
 
     @classmethod
     def signed(cls, values: FloatArray, unit: str, share: float = 1.0) -> ColourScale:
-        """Diverge from zero, with equal ends that keep this ``share`` of the values inside."""
+        """Scale that diverges from zero to ± end, which includes this ``share`` of the values."""
         end = _quantile(np.abs(values), share)
         return cls(style.SIGNED, -end, end, unit, "neither" if share == 1.0 else "both")
 
     @classmethod
     def size(cls, values: FloatArray, unit: str, share: float = 1.0) -> ColourScale:
-        """Rise from zero, with an end that keeps this ``share`` of the values inside."""
+        """Scale that rises from zero to an end, which includes this ``share`` of the values."""
         end = _quantile(values, share)
         return cls(style.SIZE, 0.0, end, unit, "neither" if share == 1.0 else "max")
 
     @property
     def normalise(self) -> Normalize:
-        """Values to 0 ... 1."""
+        """Maps values from ``low`` ... ``high`` to 0 ... 1."""
         return (LogNorm if self.is_log else Normalize)(self.low, self.high)
 
     def of(self, values: FloatArray) -> FloatArray:
-        """(..., 4) colours of values; transparent where they are NaN."""
+        """(..., 4) RGBA colours of values; transparent where these are NaN."""
         shares: Any = self.normalise(values)
         return np.array(self.colours(np.where(np.isnan(values), np.nan, shares)))
 
     @property
     def ticks(self) -> FloatArray:
-        """Round values from end to end."""
+        """Round values between the ends, for the ticks of a colour bar."""
         subs = (1.0,) if self.high > 100 * self.low else (1.0, 2.0, 5.0)
         locator = LogLocator(10.0, subs) if self.is_log else MaxNLocator(7, steps=_STEPS)
         values = np.asarray(locator.tick_values(self.low, self.high))
@@ -142,13 +142,13 @@ class ColourScale:
 
     @property
     def power(self) -> int:
-        """Of ten, which stands beside the unit of very small and very large values."""
+        """Exponent of the power of ten beside the unit of very small or large values, else 0."""
         power = int(np.floor(np.log10(max(abs(self.low), abs(self.high)))))
         return 0 if self.is_log or -3 <= power < 5 else power
 
     @property
     def labels(self) -> list[str]:
-        """The ticks as they are written, all with as many decimals unless logarithmic."""
+        """Labels of the ticks, with equal numbers of decimals unless logarithmic."""
         plain = [f"{tick:.6g}" for tick in self.ticks / 10.0**self.power + 0.0]
         decimals = max((len(text.partition(".")[2]) for text in plain), default=0)
         texts = plain if self.is_log else [f"{float(text):.{decimals}f}" for text in plain]
@@ -162,9 +162,9 @@ def draw_field(
     motion: DisplacementFunction | None = None,
     unit: str = "mm",
 ) -> Figure:
-    """Draw a field of the reference configuration, where it is or where ``motion`` takes it.
+    """Draw a field of the reference configuration, undeformed or displaced by ``motion``.
 
-    ``values``: (rows, cols) on ``map_frame.grid``; NaN is left blank. ``unit``: of lengths.
+    ``values``: (rows, cols) on ``map_frame.grid``; NaN is left blank. ``unit``: unit of lengths.
     """
     drawn, axes = empty_map(map_frame, unit=unit)
     _draw_cells(axes, map_frame, scale.of(values), motion)
@@ -181,11 +181,11 @@ def draw_image(
     scale: ColourScale | None = None,
     unit: str = "mm",
 ) -> Figure:
-    """Draw an image, its background left to the page.
+    """Draw an image with a transparent background.
 
-    ``image``, ``material``: (rows, cols) grey levels [0 black, 1 white] and where they show
-    material, None for everywhere; ``grid``: their pixels. ``displacement``: (n, 2) true
-    displacement at the mesh's nodes, for the boundary. ``scale``: by default of full scale.
+    ``image``: (rows, cols) grey levels, 0 black to 1 white; ``material``: (rows, cols) True on
+    material, None for everywhere; ``grid``: their pixels. ``displacement``: (n, 2) of the mesh's
+    nodes [mm], for the boundary. ``scale``: of the grey levels, by default 0 to 1 of full scale.
     """
     drawn, axes = empty_map(map_frame, unit=unit)
     show_grey(axes, map_frame, image, material, grid)
@@ -214,13 +214,13 @@ def draw_blend(
     scale: ColourScale,
     motion: DisplacementFunction,
 ) -> Figure:
-    """Let the deformed image dissolve, from left to right, into what was measured in it.
+    """Draw the deformed image, fading from left to right into a field that was measured in it.
 
-    ``image``, ``material``, ``grid``: as for :func:`draw_image`. ``values``: (rows, cols) on
-    ``map_frame.grid``, what was measured, drawn with the displacement ``motion``.
+    ``image``, ``material``, ``grid``: as for :func:`draw_image`. ``values``: (rows, cols) measured
+    field on ``map_frame.grid``, displaced by ``motion``.
     """
     drawn, axes = empty_map(map_frame, width=3.2)
-    # Gone where the field is opaque, or slivers of it would show along the holes.
+    # The image is transparent where the field is opaque, or its edges would show at the holes.
     show_grey(axes, map_frame, image, material, grid, dissolve=True)
     colours = scale.of(values)
     colours[..., 3] *= _ramp(values.shape)
@@ -232,7 +232,7 @@ def draw_blend(
 def _draw_cells(
     axes: Axes, map_frame: MapFrame, colours: FloatArray, motion: DisplacementFunction | None
 ) -> None:
-    """Cells (rows, cols, 4) in their colours, cut out along the boundary, and the boundary."""
+    """Draw cells of RGBA ``colours`` (rows, cols, 4), clipped to the boundary, and the boundary."""
     moved = None if motion is None else map_frame.moved_nodes(motion)
     edge = draw_edge(axes, map_frame.boundary.path(moved))
     if motion is None:
@@ -248,7 +248,7 @@ def _draw_cells(
 def shaded(
     axes: Axes, mesh: Mesh, moved: FloatArray, values: FloatArray, scale: ColourScale
 ) -> Collection:
-    """Shade T6 elements by values (n,) at their nodes, which are ``moved`` (n, 2) [mm]."""
+    """Colour T6 elements by nodal values (n,); their nodes are displaced by ``moved`` [mm]."""
     x, y = (mesh.nodes + moved).T
     triangles = Triangulation(x, y, mesh.cells[:, np.array(_FINER)].reshape(-1, 3))
     return axes.tripcolor(triangles, values, shading="gouraud", rasterized=True,
@@ -256,7 +256,7 @@ def shaded(
 
 
 def empty_map(map_frame: MapFrame, width: float = WIDTH, unit: str = "mm") -> tuple[Figure, Axes]:
-    """An empty map with a scale bar."""
+    """Make an empty map with a scale bar; ``width`` of the figure [in]."""
     left, right, bottom, top = map_frame.limits
     size = np.array([right - left, top - bottom])
     drawn, axes = bare_axes(width, size, _MAP, _BELOW, _ABOVE)
@@ -269,9 +269,9 @@ def empty_map(map_frame: MapFrame, width: float = WIDTH, unit: str = "mm") -> tu
 def bare_axes(
     width: float, size: FloatArray, share: float, below: float, above: float, left: float = 0.01
 ) -> tuple[Figure, Axes]:
-    """Axes without any frame for something of a ``size`` (2,), over a share of a figure's width.
+    """Make a figure of a ``width`` [in], and invisible axes with the aspect ratio of ``size``.
 
-    ``below``, ``above``: room for what is written there [in]. ``left``: share of the width.
+    ``share``, ``left``: width and left end of the axes over ``width``. ``below``, ``above`` [in].
     """
     tall = share * width * size[1] / size[0]
     height = tall + below + above
@@ -282,15 +282,15 @@ def bare_axes(
 
 
 def draw_edge(axes: Axes, path: Path) -> PathPatch:
-    """Draw a boundary."""
+    """Draw a boundary as a thin line."""
     return style.draw_path(axes, path, fill=False, ec=style.EDGE, lw=0.5, rasterized=True,
                            clip_on=False, zorder=1.5)  # fmt: skip
 
 
 def colour_bar(axes: Axes, scale: ColourScale) -> None:
-    """A bar to the right of the axes, its unit above it.
+    """Draw a colour bar to the right of the axes, and its unit above it.
 
-    Made of a few artists: axes of its own, as matplotlib's have, take longer than the map.
+    It has no axes, unlike matplotlib's colour bars: drawing these would take longer than the map.
     """
     drawn, box = axes.get_figure(root=True), axes.get_position()
     assert drawn is not None
@@ -324,7 +324,7 @@ def colour_bar(axes: Axes, scale: ColourScale) -> None:
 
 
 def _ramp(shape: tuple[int, ...]) -> FloatArray:
-    """0 on the left, 1 on the right, a smooth slope between them that leans to the left."""
+    """0 on the left, 1 on the right; the smooth transition is further left in lower rows."""
     up, along = np.mgrid[0 : 1 : shape[0] * 1j, 0 : 1 : shape[1] * 1j]
     t = np.clip((along + 0.25 * up - 0.48) / 0.28, 0.0, 1.0)
     return np.asarray(t**2 * (3 - 2 * t))
@@ -338,7 +338,7 @@ def show_grey(
     grid: PixelGrid,
     dissolve: bool = False,
 ) -> None:
-    """Show an image averaged over blocks of pixels, its background transparent."""
+    """Show an image averaged over blocks of pixels, transparent off the material."""
     joined = max(1, map_frame.factor // 2)
     if material is None:
         level = block_means(image, joined)
@@ -354,13 +354,13 @@ def show_grey(
 
 
 def _quantile(values: FloatArray, share: float) -> float:
-    """The value that this share of the finite ones does not exceed; 1 where there is none."""
+    """Quantile ``share`` of the finite values; 1 if there are none or it isn't positive."""
     finite = values[np.isfinite(values)]
     end = float(np.quantile(finite, share)) if finite.size else 0.0
     return end if end > 0.0 else 1.0
 
 
 def _round_down(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    """Largest value of the form 1, 2 or 5 times a power of ten that is at most ``length``."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(power * max(step for step in (1, 2, 5) if step * power <= length))

@@ -1,4 +1,4 @@
-"""Measured fields drawn on photographs, animated, and printed to PDF; what gauges have read."""
+"""Measured fields on photographs, as figures, animations and PDF, and readings of gauges."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from modeharvest.util.progress import Progress, counted, silent
 
 PRINTED = ("u", "v", "logarithmic_xx", "logarithmic_yy", "logarithmic_xy", "rotation", "stretch_1")
 _WIDTH, _CELLS, _DPI, _MS, _MOST_ROWS = 5.6, 700, 120, 400, 60
-_OPAQUE, _KEPT = 0.65, 0.995  # over a photograph; share of values inside the colours' ends
+_OPAQUE, _KEPT = 0.65, 0.995  # opacity over a photograph; upper quantile, where colours end
 Draw = Callable[[], Figure]
 
 
@@ -35,7 +35,7 @@ def draw_on_photograph(
     result: NodalResult, values: FloatArray, scale: maps.ColourScale,
     picture: FloatImage | None, title: str = "", unit: str = "mm",
 ) -> Figure:  # fmt: skip
-    """Draw nodal values (n,) over the deformed photograph (rows, cols), from 0 to 1, or none."""
+    """Draw nodal values (n,) over the deformed photograph (rows, cols), 0 to 1, if there is one."""
     grid, moved = result.grid, result.displacement
     factor = max(1, round(max(grid.shape) / _CELLS))
     frame = maps.MapFrame(MeshBoundary.of(result.mesh), grid.binned(factor), factor, grid.extent)
@@ -44,7 +44,7 @@ def draw_on_photograph(
         maps.show_grey(axes, frame, picture, None, grid)
     maps.shaded(axes, result.mesh, moved, values, scale)
     edge = maps.draw_edge(axes, frame.boundary.path(moved))
-    if picture is not None:  # once more above it: where triangles are clear their sides show twice
+    if picture is not None:  # again, on top: sides of transparent triangles would be visible
         maps.show_grey(axes, frame, picture, None, grid)
         axes.images[-1].set(alpha=1.0 - _OPAQUE, clip_path=edge, zorder=1.4)
     axes.set(xlim=frame.limits[:2], ylim=frame.limits[2:])
@@ -54,7 +54,7 @@ def draw_on_photograph(
 
 
 def frames(run: FinishedRun, name: str, progress: Progress = silent) -> list[Draw]:
-    """What draws a field's component on each photograph of a run, in the same colours."""
+    """Functions that draw a field's component on each photograph of a run, in common colours."""
     ends, unit = [], ""
     for image in counted(tuple(run.files), progress, "colours"):
         values, unit = run.component(image, name)
@@ -73,7 +73,7 @@ def frames(run: FinishedRun, name: str, progress: Progress = silent) -> list[Dra
 
 
 def animate(run: FinishedRun, name: str, path: Path, progress: Progress = silent) -> None:
-    """Write a field on a run's photographs as GIF, or as MP4, which needs imageio-ffmpeg."""
+    """Write an animation of a field on a run's photographs, as GIF or (by imageio-ffmpeg) MP4."""
     drawn = map(_pixels, counted(frames(run, name, progress), progress, "draw"))
     with atomic(path) as part:
         if path.suffix == ".gif":
@@ -96,7 +96,7 @@ def animate(run: FinishedRun, name: str, path: Path, progress: Progress = silent
 
 
 def _pixels(draw: Draw) -> NDArray[np.uint8]:
-    """(rows, cols, 3) a figure's pixels, of blocks of 16 as video has them."""
+    """(rows, cols, 3) pixels of a figure, padded to multiples of 16 as video formats need."""
     with style.style():
         drawn = draw()
         drawn.set(dpi=_DPI, facecolor="white")
@@ -108,9 +108,9 @@ def _pixels(draw: Draw) -> NDArray[np.uint8]:
 
 
 def draw_gauge(name: str, readings: Sequence[Readings], strain: FloatArray | None = None) -> Figure:
-    """Draw the strains that a gauge has read in each image, with 95 % intervals.
+    """Draw the strains read by a gauge in each image, with 95 % intervals.
 
-    Over the images' numbers, or over a strain (n,) of each.
+    The abscissa is the image's number, or if given, ``strain`` (n,) along x of each image [-].
     """
     drawn = style.figure(3.6, 2.4)
     axes = drawn.add_axes((0.22, 0.19, 0.75, 0.69))
@@ -131,7 +131,7 @@ def draw_gauge(name: str, readings: Sequence[Readings], strain: FloatArray | Non
 def draw_gauges_on(
     result: NodalResult, gauges: Sequence[Gauge], picture: FloatImage | None, unit: str
 ) -> Figure:
-    """Draw gauges where they have moved to, on the deformed photograph (rows, cols), 0 to 1."""
+    """Draw displaced gauges on the deformed photograph (rows, cols), 0 to 1, if there is one."""
     grid = result.grid
     factor = max(1, round(max(grid.shape) / _CELLS))
     frame = maps.MapFrame(MeshBoundary.of(result.mesh), grid.binned(factor), factor, grid.extent)
@@ -140,7 +140,7 @@ def draw_gauges_on(
         maps.show_grey(axes, frame, picture, None, grid)
     for k, gauge in enumerate(gauges):
         corners = gauge.corners(grid)
-        moved = corners + np.nan_to_num(result.at(corners))  # a polygon's may be in a hole
+        moved = corners + np.nan_to_num(result.at(corners))  # NaN for corners in a hole
         closed = np.vstack([moved, moved[:1]]) if gauge.polygon else moved
         axes.plot(*closed.T, "o-", color=style.colour(k), ms=4, lw=1.6)
         axes.annotate(gauge.name, moved[0], (6, 6), textcoords="offset points", fontsize=8.5,
@@ -152,10 +152,10 @@ def draw_gauges_on(
 def gauge_cards(
     rows: Sequence[Mapping[str, Any]], strains: Mapping[str, float], placed: Draw | None
 ) -> list[Card]:
-    """Gauges on the last photograph, their strains over the test, and all that they read in it.
+    """Make cards of the gauges on the last photograph, their strains, and the last readings.
 
-    ``rows``: of ``summary.json``; ``strains``: along x [-] by the images' names, in their order;
-    ``placed``: draws the gauges.
+    ``rows``: readings in ``summary.json``; ``strains``: mean strain along x [-] by image name, in
+    the order of the test; ``placed``: draws the gauges, None for no figure of them.
     """
     if not rows:
         return []
@@ -181,7 +181,7 @@ def gauge_cards(
 def print_fields(
     run: FinishedRun, names: Sequence[str], path: Path, progress: Progress = silent
 ) -> None:
-    """Write fields on all photographs of a run as PDF, and how large they are."""
+    """Write a PDF of fields on all photographs of a run, with a table of their quantiles."""
     pages, rows = list[Draw](), [["image", "field", "5 %", "median", "95 %", "unit"]]
     for name in names:
         pages += frames(run, name, progress)
@@ -189,20 +189,24 @@ def print_fields(
             values, unit = run.component(image, name)
             some = np.nanquantile(values, [0.05, 0.5, 0.95])
             rows.append([image, name, *(f"{value:.4g}" for value in some), unit])
-    write_pdf(path, "Displacement and strain", rows[:_MOST_ROWS], pages)
+    write_pdf(path, "Displacement and strain", rows, pages)
 
 
 def write_pdf(
     path: Path, title: str, numbers: Sequence[Sequence[str]], pages: Iterable[Draw]
 ) -> None:
-    """Write a title, a table of numbers (its first row the heads), and figures, a page each."""
+    """Write a PDF: a title, a table of numbers (headings in the first row), a page per figure."""
+    head, *rows = map(list, numbers)
     with atomic(path) as part, style.style(), PdfPages(part) as pdf:
-        cover = style.figure(8.27, 11.69)
-        axes = cover.add_axes((0.08, 0.05, 0.84, 0.88))
-        axes.set_axis_off()
-        axes.set_title(title, fontsize=14, loc="left")
-        table = axes.table([*map(list, numbers)], loc="upper left", cellLoc="left", edges="B")
-        table.auto_set_font_size(False)
-        table.set_fontsize(7.5)
-        for draw in (lambda: cover, *pages):
-            pdf.savefig(draw(), dpi=200, bbox_inches="tight", pad_inches=0.4)
+        save = partial(pdf.savefig, dpi=200, bbox_inches="tight", pad_inches=0.4)
+        for k in range(0, max(len(rows), 1), _MOST_ROWS):
+            axes = (cover := style.figure(8.27, 11.69)).add_axes((0.08, 0.05, 0.84, 0.88))
+            axes.set_axis_off()
+            axes.set_title(title, fontsize=14, loc="left")
+            some = [head, *rows[k : k + _MOST_ROWS]]
+            table = axes.table(some, loc="upper left", cellLoc="left", edges="B")
+            table.auto_set_font_size(False)
+            table.set_fontsize(7.5)
+            save(cover)
+        for draw in pages:
+            save(draw())

@@ -44,15 +44,15 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.truth import lengths
 
 CLOSE = 3
-"""Cells along the side of a closer look."""
+"""Side of a close-up, in unit cells."""
 _NO_PATTERN = WavePattern((), None, ())
-_SPECK = 0.01  # l²: holes and islands smaller than that are not drawn
+_SPECK = 0.01  # largest area of holes and islands that are not drawn [l²]
 _LEVELS = (0.5, 99.5)  # percentiles of the reference's grey levels, drawn black and white
-_REACH = 0.75  # spacings of a local DIC from a point, within which a cell has its value
+_REACH = 0.75  # distance from a local DIC point up to which cells have its value [spacings]
 
 
 def shown_frames(harvest: Harvest) -> tuple[HarvestedFrame, ...]:
-    """The frames with pictures."""
+    """Photographs that are shown as figures."""
     frames, moments = harvest.frames, harvest.timeline
     if len(frames) != len(moments):
         return frames[:MOST_SHOWN]
@@ -60,7 +60,7 @@ def shown_frames(harvest: Harvest) -> tuple[HarvestedFrame, ...]:
 
 
 def material_boundary(harvest: Harvest) -> MeshBoundary:
-    """Of the material in the reference; of the whole image if no material was found."""
+    """Boundary of the reference's material, or of the whole image if no material was found."""
     found = mask_boundary(harvest.mask, harvest.grid, _SPECK * harvest.pitch**2)
     everything = np.ones_like(harvest.mask)
     return found if len(found.nodes) else mask_boundary(everything, harvest.grid)
@@ -74,7 +74,7 @@ def drawn_levels(harvest: Harvest) -> tuple[float, float]:
 
 
 def grey_levels(image: NDArray[Any], levels: tuple[float, float]) -> NDArray[np.float32]:
-    """Grey levels of a photograph as 0 (black) to 1 (white)."""
+    """Scale a photograph so that the two ``levels`` become 0 (black) and 1 (white); clipped."""
     low, high = map(np.float32, levels)
     return np.clip((np.asarray(image, dtype=np.float32) - low) / (high - low), 0.0, 1.0)
 
@@ -90,7 +90,7 @@ class PhotographState(fits.FittedState):
 
 
 def photograph_states(harvest: Harvest, labels: Mapping[str, str]) -> list[PhotographState]:
-    """The photographs that are shown, with their labels by name."""
+    """States of the photographs that are shown; ``labels``: labels by the photographs' names."""
     shown = shown_frames(harvest)
     view = fits.SpecimenView(material_boundary(harvest), harvest.grid, harvest.mask, harvest.pitch)
     levels = drawn_levels(harvest)
@@ -110,21 +110,21 @@ def photograph_states(harvest: Harvest, labels: Mapping[str, str]) -> list[Photo
 
 
 def draw_hero(state: PhotographState) -> Figure:
-    """Let a photograph dissolve into the pattern that was found in it."""
+    """Draw a photograph that fades into the size of the pattern measured in it."""
     result, map_frame = state.result, state.view.map_frame()
     pattern = result.displacement(map_frame.grid)
     if state.frame.modes:
         pattern = pattern - result.v0(map_frame.grid)
     image = grey_levels(state.frame.image, state.levels)
     drawn = fits.draw_dissolving(state, image, None, UM * np.linalg.norm(pattern, axis=-1))
-    # The photograph ends where the measured boundary does: a mask of it may have ragged edges.
+    # The photograph is clipped to the measured boundary: its mask may have ragged edges.
     axes = drawn.axes[0]
     axes.images[0].set_clip_path(axes.patches[0])
     return drawn
 
 
 def draw_deformed(state: PhotographState) -> Figure:
-    """Draw a deformed photograph, and over it the reference's boundary moved as measured."""
+    """Draw a deformed photograph with the reference's boundary, displaced as measured."""
     map_frame = state.view.map_frame()
     moved = map_frame.moved_nodes(state.motion)
     image = grey_levels(state.frame.image, state.levels)
@@ -136,7 +136,7 @@ def draw_deformed(state: PhotographState) -> Figure:
 
 
 def draw_closeup(state: PhotographState) -> Figure:
-    """Draw some cells of a deformed photograph, pixel by pixel, with the boundary as measured."""
+    """Draw a few cells of a deformed photograph in full resolution, with the measured boundary."""
     grid, middle = state.view.grid, np.array(state.harvest.geometry.region.cellular.centre)
     x, y = middle + state.motion(*middle[:, None, None])[0, 0]
     half = 0.5 * CLOSE * state.view.pitch
@@ -164,7 +164,7 @@ def _show(axes: Axes, grey: NDArray[Any], extent: tuple[float, float, float, flo
 
 
 def draw_part_spectrum(state: PhotographState, part: int, component: int) -> Figure:
-    """S_xx or S_yy of a part with modes of its own; the colours are that part's."""
+    """Draw S_xx or S_yy of a part of the displacement, in the same colours for all photographs."""
     parts = [frame.parts[part] for frame in shown_frames(state.harvest)]
     end = fits.largest_density([(p.spectrum, p.pattern) for p in parts])
     own = state.frame.parts[part]
@@ -172,7 +172,7 @@ def draw_part_spectrum(state: PhotographState, part: int, component: int) -> Fig
 
 
 def draw_residual(state: PhotographState) -> Figure:
-    """Draw f - g(x + u) in the deformed configuration, single pixels; blank where not compared."""
+    """Draw the residual at single pixels in the deformed configuration; blank if not compared."""
     map_frame = state.view.map_frame(fits.FINE)
     values = residual_of(state, map_frame)
     unit = "full scale" if state.harvest.full_scale else "levels"
@@ -180,7 +180,7 @@ def draw_residual(state: PhotographState) -> Figure:
 
 
 def residual_of(state: PhotographState, map_frame: maps.MapFrame) -> FloatArray:
-    """f - g(x + u) at the pixels of a frame; NaN where not compared."""
+    """f - gain g(x + u) - offset at a frame's pixels [full scale or grey levels], or NaN."""
     harvest, ansatz, a = state.harvest, state.result.ansatz, state.result.unknowns
     (rows, cols), grid = map_frame.pixels, middle_pixels(map_frame, state.harvest.grid)
     u = state.result.displacement(grid) / grid.pixel_size * map_frame.factor
@@ -193,7 +193,7 @@ def residual_of(state: PhotographState, map_frame: maps.MapFrame) -> FloatArray:
 
 
 def draw_w(state: PhotographState) -> Figure:
-    """Draw the length of w = local DIC - IDIC in the deformed configuration."""
+    """Draw ‖w‖ (local DIC or whole displacement, minus IDIC) in the deformed configuration."""
     w, grid = state.frame.w, state.view.grid
     assert w is not None
     cells = min(fits.SMOOTH, max(40, int(max(grid.shape) * grid.pixel_size / w.spacing)))
@@ -206,14 +206,14 @@ def draw_w(state: PhotographState) -> Figure:
 
 
 def has_error(state: PhotographState, name: str, i: int, cause: str) -> bool:
-    """Whether a standard deviation, named as for :func:`draw_error`, is known."""
+    """Whether the standard deviation that :func:`draw_error` draws is known."""
     return _errors(state, cause) is not None and (name == "v0" or fits.has_mode(i)(state))
 
 
 def draw_error(state: PhotographState, name: str, i: int, cause: str) -> Figure:
     """Draw the standard deviation of "v0", or of "v" or "fluc" of mode i, by "noise" or "model".
 
-    That of a vector is the root of the sum of both components' variances.
+    For vectors it is the root of the sum of both components' variances.
     """
     map_frame, errors = state.view.map_frame(fits.COARSE), _errors(state, cause)
     assert errors is not None
@@ -233,7 +233,7 @@ def _errors(state: PhotographState, cause: str) -> FieldErrors | None:
 
 
 def _resampled(frame: HarvestedFrame, sd: FloatArray, map_frame: maps.MapFrame) -> FloatArray:
-    """Error bars on the cells of a map, linear between the axes' values; NaN if infinite."""
+    """Error bars, interpolated linearly from the frame's axes to a map's cells; NaN if infinite."""
     along_y, along_x = np.argsort(frame.error_y), np.argsort(frame.error_x)
     between = RegularGridInterpolator(
         (frame.error_y[along_y], frame.error_x[along_x]),
@@ -245,9 +245,9 @@ def _resampled(frame: HarvestedFrame, sd: FloatArray, map_frame: maps.MapFrame) 
 
 
 def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
-    """Draw a part of the error, in the deformed configuration.
+    """Draw the length of a part of the error in the deformed configuration.
 
-    "true_w" is truth - IDIC, "best" truth - best fit, "loss" best fit - IDIC.
+    ``part``: "true_w" for truth - IDIC, "best" for truth - best fit, "loss" for best fit - IDIC.
     """
     harvest, map_frame, known = state.harvest, state.view.map_frame(), truth_of(state)
     assert known is not None
@@ -258,7 +258,7 @@ def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
 
 
 def truth_of(state: PhotographState) -> FrameTruth | None:
-    """The truth of a photograph, where it is known."""
+    """The truth of a photograph; None if it is not known."""
     truth = state.harvest.truth
     return None if truth is None else truth.frames.get(state.frame.name)
 
@@ -268,15 +268,15 @@ WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(
     lambda s: None if (truth := truth_of(s)) is None else truth.displacement,
 )
 
-WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
-_LEGEND = 0.26  # [in]
-_PIXELS = 1000  # along the longer side
-_CELLS, _ARROWS = 120, 17  # of a distortion's map, along the longer side
-_LENGTH = 0.9  # of the longest arrow, distances between arrows
+WIDE, NARROW = 5.2, 3.5  # widths of figures on half a page, and on a third of it [in]
+_LEGEND = 0.26  # height of a legend [in]
+_PIXELS = 1000  # approximate number along the reference's longer side, as drawn
+_CELLS, _ARROWS = 120, 17  # number along the longer side of a distortion's map
+_LENGTH = 0.9  # length of the longest arrow, over the distance between arrows [-]
 
 
 def draw_reference(harvest: Harvest, boundary: MeshBoundary, levels: tuple[float, float]) -> Figure:
-    """Draw the reference and all that was found in it, for a look whether that is right."""
+    """Draw the reference and what was detected in it (material, lattice, region), for checking."""
     size = np.array([harvest.grid.cols, harvest.grid.rows])
     drawn, axes = maps.bare_axes(WIDE, size, 0.996, 0.02, _LEGEND, 0.002)
     factor = max(1, round(max(harvest.grid.shape) / _PIXELS))
@@ -297,7 +297,7 @@ def draw_reference(harvest: Harvest, boundary: MeshBoundary, levels: tuple[float
 
 
 def draw_distortion(distortion: Distortion, grid: PixelGrid) -> Figure:
-    """Draw the length of S in colour and S itself as arrows, enlarged; ``grid``: the images'."""
+    """Draw a distortion S: length [px] in colour, and enlarged arrows; ``grid``: image pixels."""
     drawn = _coloured(grid, np.hypot(*distortion.shift(*_positions(grid, _CELLS))))
     rows, cols = _positions(grid, _ARROWS)
     down, right, row, col = np.broadcast_arrays(*distortion.shift(rows, cols), rows, cols)
@@ -310,17 +310,17 @@ def draw_distortion(distortion: Distortion, grid: PixelGrid) -> Figure:
 
 
 def draw_distortion_sd(calibration: Calibration, grid: PixelGrid) -> Figure:
-    """Draw the standard deviation of S by the photographs' noise, both components together."""
+    """Draw the standard deviation of S by image noise [px], from both components' variances."""
     return _coloured(grid, np.hypot(*calibration.sd(*_positions(grid, _CELLS))))
 
 
 def draw_distortion_error(found: Distortion, true: Distortion, grid: PixelGrid) -> Figure:
-    """Draw the length of S_found - S_true without its affine part, which can't be observed."""
+    """Draw the length of S_found - S_true [px] without the affine part, which isn't observable."""
     return _coloured(grid, np.hypot(*apart_without_affine(found, true, *_positions(grid, _CELLS))))
 
 
 def _positions(grid: PixelGrid, count: int) -> tuple[FloatArray, FloatArray]:
-    """Middles of about ``count`` cells along the image's longer side, as an open grid [px]."""
+    """Rows (r, 1) and columns (1, c) of cells' centres [px], about ``count`` on the longer side."""
     step = max(grid.shape) / count
     rows, cols = (max(2, round(size / step)) for size in grid.shape)
     along_row = (np.arange(rows) + 0.5) * grid.rows / rows - 0.5
@@ -329,7 +329,7 @@ def _positions(grid: PixelGrid, count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _coloured(grid: PixelGrid, length: FloatArray) -> Figure:
-    """A map of lengths [px] over the whole image, in its own frame: columns right, rows down."""
+    """Draw a map of lengths [px] over the whole image, columns to the right and rows down."""
     size = np.array([grid.cols, grid.rows])
     drawn, axes = maps.bare_axes(NARROW, size, 0.77, 0.02, _LEGEND, 0.002)
     scale = ColourScale.size(length, "px")
@@ -342,7 +342,7 @@ def _coloured(grid: PixelGrid, length: FloatArray) -> Figure:
 
 
 def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Line2D]:
-    """Holes, the straight lattice through them, and what does not fit."""
+    """Draw holes, their straight lattice, and deviations from it; returns entries of a legend."""
     (i0, j0), (i1, j1) = lattice.index.min(axis=0), lattice.index.max(axis=0)
     ends = [((i, j0), (i, j1)) for i in range(i0, i1 + 1)]
     ends += [((i0, j), (i1, j)) for j in range(j0, j1 + 1)]

@@ -1,4 +1,4 @@
-"""Figures of sequences: force over strain, growth of the pattern, the last photograph."""
+"""Figures of image sequences: force over strain, growth of the pattern, the last photograph."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from modeharvest.validation.growth import Prediction
 
 
 def force_cards(frames: Sequence[Mapping[str, Any]], key: str, what: str) -> list[Card]:
-    """Force over strain, if a machine's log gives forces of two photographs at least.
+    """Make a card of force over strain, if the force is known for at least two photographs.
 
-    ``frames``: of ``summary.json``; ``key`` of their strain, which is called ``what``.
+    ``frames``: photographs in ``summary.json``; ``key``: key of their strain; ``what``: its label.
     """
     known = [frame for frame in frames if frame.get("force_N") is not None]
     if len(known) < 2:
@@ -43,9 +43,9 @@ def draw_force(strain: FloatArray, force: FloatArray, what: str) -> Figure:
 def write_watch_page(
     path: Path, title: str, test: WatchedTest, photograph: FloatImage | None
 ) -> None:
-    """Write the page of a test that is watched; it reloads itself until the test is over.
+    """Write the page of a test that is watched; it reloads itself until watching has ended.
 
-    ``photograph``: the last one, (rows, cols) of any scale.
+    ``photograph``: the last photograph (rows, cols), in any grey scale; None if not available.
     """
     last = next(reversed(test.predictions), None)
     figures = {}
@@ -73,7 +73,7 @@ def write_watch_page(
 
 
 def watch_text(test: WatchedTest) -> str:
-    """What is known of a test so far, in a sentence or two."""
+    """Summary of a watched test, in a few sentences."""
     if not test.rows:
         return f"No photograph has been measured yet. {test.conclusion}"
     last, found = test.rows[-1], test.predictions[-1]
@@ -92,7 +92,7 @@ def watch_text(test: WatchedTest) -> str:
 
 
 def draw_photograph(image: FloatImage) -> Figure:
-    """Draw a photograph, of few pixels, as dark and bright as it is."""
+    """Draw a photograph in low resolution, its contrast stretched between percentiles."""
     step = max(1, max(image.shape) // 500)
     few = image[::step, ::step]
     drawn = figure(4.2, 4.2 * few.shape[0] / few.shape[1])
@@ -108,7 +108,7 @@ def _interval(axes: Any, found: Prediction) -> None:
 
 
 def draw_amplitude(test: WatchedTest, found: Prediction | None) -> Figure:
-    """Draw v1's half wave over the strain, and the growth that was fitted to it."""
+    """Draw the amplitude of v1's half wave over the strain, and the growth fitted to it."""
     strain, amplitude, sd, _ = test.columns
     drawn, axes = curve("nominal strain [%]", "v₁, half wave [µm]")
     axes.errorbar(100 * strain, 1e3 * amplitude, 2e3 * sd, fmt="o", color=BLUE, ms=3.5, lw=1)
@@ -124,7 +124,7 @@ def draw_amplitude(test: WatchedTest, found: Prediction | None) -> Figure:
 
 
 def draw_growth(test: WatchedTest, found: Prediction) -> Figure:
-    """Draw strain over the critical mode's amplitude: a line that ends at the critical strain."""
+    """Draw strain / amplitude of the critical mode over strain: it falls to 0 at buckling."""
     strain, amplitude, sd, _ = test.columns
     own = np.sign(found.imperfection) * (amplitude - np.polyval(found.others, strain))
     good = (strain > 0) & (own > 2 * sd) & (own > 0.1 * own.max(initial=0.0))

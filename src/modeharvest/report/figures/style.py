@@ -1,7 +1,7 @@
-"""Style of all figures: colours, type, and SVG that follows the page.
+"""Style of all figures: colours, fonts, and conversion to SVG that adopts the page's colours.
 
-Figures are SVG inside the page: fields are pixels, labels are text. Two sentinel colours stand for
-the page's ink, so the same figure is right on a light and on a dark page.
+Figures are SVG elements of the page: fields are raster images, labels are text. Two placeholder
+colours are replaced by the page's text colours, so that figures suit light and dark pages.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from PIL import Image
 from modeharvest.util.arrays import FloatArray
 
 INK, MUTED = "#010204", "#010305"
-"""Stand-ins for the page's colours of text and of secondary text."""
+"""Placeholders for the page's colours of text and of secondary text."""
 BLUE, RED, GREEN, GOLD = "#3987e5", "#e0603f", "#2a9d74", "#d99a1f"
-"""For curves; of a middle lightness, to be read on light and on dark."""
+"""Colours of curves, of medium lightness, so that they are visible on light and dark pages."""
 COLOURS = (BLUE, RED, GREEN, GOLD)
-"""Of curves side by side, in this order."""
+"""Colours of several curves in one figure, in this order."""
 EDGE = "#70757d"
 DPI = 260
-"""Of the pixel parts; a picture of 2.35 in is 611 px wide."""
+"""Resolution of raster images [px/in]; a figure of 2.35 in is 611 px wide."""
 
 QUALITY = 90
-"""Of the pixel parts, out of 100."""
+"""WebP quality of raster images, out of 100."""
 
-_RC: dict[Any, Any] = {  # matplotlib types the names, a different way in each version
+_RC: dict[Any, Any] = {  # matplotlib's type of the names differs between versions
     "svg.fonttype": "none",
     "svg.hashsalt": "modeharvest",
     "font.size": 8.0,
@@ -50,7 +50,7 @@ _RC: dict[Any, Any] = {  # matplotlib types the names, a different way in each v
     "axes.labelcolor": INK,
     "axes.facecolor": "none",
     "axes.linewidth": 0.6,
-    "axes.titley": 1.0,  # by default all ticks are measured to see if the title is in their way
+    "axes.titley": 1.0,  # by default all ticks are measured to place the title, which is slow
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.unicode_minus": True,
@@ -72,20 +72,20 @@ _RC: dict[Any, Any] = {  # matplotlib types the names, a different way in each v
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw in the report's style inside this block; matplotlib's own settings come back."""
+    """Use the report's style in a ``with`` block; matplotlib's settings are restored after it."""
     with mpl.rc_context(_RC):
         yield
 
 
 def figure(width: float, height: float) -> Figure:
-    """Make a figure [in] that no pyplot knows of, ready to draw into."""
+    """Make an empty figure (width, height [in]) that is not registered with pyplot."""
     made = Figure(figsize=(width, height), dpi=DPI)
     FigureCanvasAgg(made)
     return made
 
 
 def _oklch_to_srgb(L: FloatArray, C: FloatArray, hue: float) -> FloatArray:
-    """(n, 3) colours of equal steps in perceived lightness (B. Ottosson's Oklab, 2020)."""
+    """(n, 3) sRGB of lightness L (n,), chroma C (n,) and hue [deg] (B. Ottosson's Oklab, 2020)."""
     to_roots = np.array([[0.3963377774, 0.2158037573], [-0.1055613458, -0.0638541728],
                          [-0.0894841775, -1.2914855480]])  # fmt: skip
     to_rgb = np.array([[4.0767416621, -3.3077115913, 0.2309699292],
@@ -98,7 +98,7 @@ def _oklch_to_srgb(L: FloatArray, C: FloatArray, hue: float) -> FloatArray:
 
 
 def _diverging() -> Colormap:
-    """Blue through near-white to red; lightness falls evenly to either side."""
+    """Make a colour map from blue over near-white to red, with linear lightness on both sides."""
     t = np.linspace(0.0, 1.0, 128)
     lightness, chroma = 0.965 - 0.56 * t, 0.165 * np.sin(0.5 * np.pi * np.minimum(1.25 * t, 1.0))
     chroma *= 1.0 - 0.25 * np.maximum(0.0, t - 0.6) / 0.4
@@ -116,15 +116,15 @@ _MANY = (*COLOURS, *map(to_hex, mpl.colormaps["tab10"].colors[4:]))  # type: ign
 
 
 def colour(n: int) -> str:
-    """Of the n-th curve, "#rrggbb"; the same in all pictures of a page."""
+    """Colour of the n-th curve, "#rrggbb", the same in all figures of a page."""
     return _MANY[n % len(_MANY)]
 
 
 def draw_path(axes: Axes, path: Path, **looks: Any) -> PathPatch:
-    """Draw a path into axes whose limits are set by other means; returns its patch.
+    """Draw a path into axes whose limits are set separately; returns its patch.
 
-    Unlike ``Axes.add_patch`` it does not seek the extent of every curved piece: on a specimen's
-    boundary that takes longer than drawing it.
+    Unlike ``Axes.add_patch`` it does not compute the extent of every curved segment, which takes
+    longer than drawing if the path is a specimen's boundary.
     """
     patch = PathPatch(path, **looks)
     axes.add_artist(patch)
@@ -132,7 +132,7 @@ def draw_path(axes: Axes, path: Path, **looks: Any) -> PathPatch:
 
 
 def scale_bar(axes: Axes, length: float, text: str) -> None:
-    """Put a bar of ``length`` [data units] below the lower left corner of the axes."""
+    """Draw a scale bar of ``length`` [data units] below the lower left corner of the axes."""
     left, (bottom, top) = axes.get_xlim()[0], axes.get_ylim()
     drop = 0.012 * abs(top - bottom)
     axes.plot([left, left + length], [bottom - drop] * 2, color=INK, lw=1.6, clip_on=False,
@@ -144,9 +144,9 @@ def scale_bar(axes: Axes, length: float, text: str) -> None:
 def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
     """Turn a figure into an SVG element for an HTML page.
 
-    ``name``: prefix that keeps the ids of this picture apart from all others
-    in the page. ``title``: what the picture shows, for those who cannot see it. ``exact``: keep
-    every pixel as it is: for fields as fine as the pixels, whose colours would run.
+    ``name``: prefix that makes the ids of this figure unique on the page. ``title``: description
+    for screen readers. ``exact``: store raster images without loss, for fields as fine as the
+    pixels, whose colours lossy compression would mix.
     """
     buffer = io.StringIO()
     width, height = drawn.get_size_inches()
@@ -165,7 +165,7 @@ def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
     svg = re.sub(r' id="([^"]+)"', rf' id="{name}-\1"', svg)
     svg = svg.replace("url(#", f"url(#{name}-")
     svg = re.sub(r'xlink:href="#', f'href="#{name}-', svg).replace("xlink:href=", "href=")
-    svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # it would be the page's, too
+    svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # it would apply to the whole page
     svg = re.sub(r"font: [^;\"]*?([\d.]+px)[^;\"]*", r"font-size: \1", svg)
     svg = re.sub(r"font-family: [^;\"]*;?", "", svg)
     svg = re.sub(r' d="([^"]*)"', _rounded, svg)
@@ -179,17 +179,17 @@ def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
 
 
 def _rounded(found: re.Match[str]) -> str:
-    """A path to a hundredth of a point: half the size, and nothing to be seen of it."""
+    """Cut a path's coordinates to 0.01 pt, which halves its size without a visible change."""
     return ' d="' + re.sub(r"(\.\d\d)\d+", r"\1", found.group(1)).replace(" \n", " ") + '"'
 
 
 class _WebPRenderer(RendererSVG):
-    """Writes SVG with its pixels as WebP: lossless (exact) or a third of the size of PNG."""
+    """Writes SVG with raster images as WebP: lossless if exact, else a third of PNG's size."""
 
     exact = False
 
     def draw_image(self, gc: Any, x: float, y: float, im: Any, transform: Any = None) -> None:
-        """Write what was drawn as pixels, (rows, cols, 4) bytes, its lower left corner at x, y."""
+        """Write a raster image ``im``, (rows, cols, 4) bytes, its lower left corner at x, y."""
         assert transform is None, "what is drawn as pixels has no transform left"
         rows, cols = im.shape[:2]
         width, height = 72 * cols / self.image_dpi, 72 * rows / self.image_dpi

@@ -1,4 +1,4 @@
-"""The whole displacement on a page: its maps, of any kind of run, and tables of photographs."""
+"""Figures of the whole displacement: maps for any kind of run, and tables for photographs."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from modeharvest.validation.truth import lengths
 from modeharvest.validation.whole_field import WholeFieldNumbers, WholeFieldSummary
 
 _SHARE = 0.98
-"""Of the pixels whose values are within the colours: at edges a few are much larger."""
+"""Share of pixels with values within the colours' range; a few at edges are much larger."""
 Numbers = Mapping[str, Any]
-"""A whole displacement's in ``summary.json``."""
+"""Numbers of a whole displacement in ``summary.json``."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class WholeMaps(Generic[S]):
 
     whole: Callable[[S], WholeField | None]
     truth: Callable[[S], FloatArray | None]
-    """Of a state, where they are known; may wait for them. The truth is (rows, cols, 2) at the
-    images' pixels [mm]."""
+    """Whole displacement of a state, and its truth (rows, cols, 2) at the images' pixels [mm]; None
+    if not known. Calls may wait until they are computed."""
     is_known: Callable[[S], bool] | None = None
-    """Whether both are, where finding out may wait otherwise."""
+    """Whether both are known or being computed; needed if the calls above may wait."""
 
     def panels(self, figure: str = "-", scale: str = "whole-scale") -> list[Panel[S]]:
-        """Their panels; ``figure``: in the paper; ``scale``: name of the text on w's colours."""
+        """Make the panels; ``figure``: w's number in the paper; ``scale``: name of w's texts."""
 
         def shows(state: S) -> bool:
             return self.is_known(state) if self.is_known else self.whole(state) is not None
@@ -59,7 +59,7 @@ class WholeMaps(Generic[S]):
         return whole.measured
 
     def _w(self, state: S) -> Figure:
-        """Measured u - v0 - sum v_i phi_i, on the colours of the true one where it is known."""
+        """Draw ‖u - v0 - sum v_i phi_i‖ of the measured u, with colours for the true u if known."""
         frame, result = state.view.map_frame(), state.result
         grid = middle_pixels(frame, state.view.grid)
         by_idic = result.displacement(grid)
@@ -76,7 +76,7 @@ class WholeMaps(Generic[S]):
         return fits.draw_length(state, state.view.map_frame().average(error), share=_SHARE)
 
     def _principal_strain(self, state: S) -> Figure:
-        """The logarithmic strain of larger size, tension positive."""
+        """Draw the principal logarithmic strain of larger magnitude, tension positive."""
         frame, measured = state.view.map_frame(), self._measured(state)
         values = np.linalg.eigvalsh(measured.field("logarithmic"))
         is_first = np.abs(values[:, :1]) > np.abs(values[:, 1:])
@@ -91,14 +91,14 @@ class WholeMaps(Generic[S]):
 
 
 def middle_pixels(frame: MapFrame, grid: PixelGrid) -> PixelGrid:
-    """The images' pixels in the middle of a map's cells."""
+    """Grid of the images' pixels at the middles of a map's cells."""
     rows, cols = frame.pixels
     x, y = grid.to_mm(rows[0], cols[0])
     return PixelGrid(len(rows), len(cols), frame.factor * grid.pixel_size, float(x), float(y))
 
 
 def whole_panel_numbers(key: str, numbers: Numbers) -> str:
-    """One line under the picture of a panel; empty if there is nothing to add."""
+    """Line of numbers below a panel's figure; empty if there are none."""
     if key == "whole-w" and "w_rms_px" in numbers:
         return text_of(key, **numbers)
     if key == "whole-error":
@@ -110,7 +110,7 @@ def whole_panel_numbers(key: str, numbers: Numbers) -> str:
 
 
 def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
-    """Tables of whole displacements in photographs, each with its label: numbers, modes."""
+    """Make cards with tables of labelled whole displacements in photographs: numbers, modes."""
     if not found:
         return []
     labels, numbers = zip(*found, strict=True)
@@ -123,7 +123,7 @@ def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
 
 
 def _mode_rows(numbers: Sequence[Numbers]) -> Iterable[tuple[Cell, ...]]:
-    """Of every mode its largest amplitude and its parameters, by both ways in each photograph."""
+    """Rows with each mode's largest amplitude and parameters, by both fits in each photograph."""
     for i in range(max(len(n["modes"]) for n in numbers)):
         modes: list[Numbers] = [
             n["modes"][i] if i < len(n["modes"]) else {"parameters": ()} for n in numbers

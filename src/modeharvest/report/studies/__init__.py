@@ -1,1 +1,1 @@
-"""Reports of studies: what a table of many cases shows, in numbers, sentences and figures."""
+"""Reports of studies: results of many cases as numbers, sentences, tables and figures."""

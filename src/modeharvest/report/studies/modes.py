@@ -1,4 +1,4 @@
-"""Report of measured modes: parameters, overlaps, patterns of all specimens."""
+"""Report of the study of measured modes: parameters, overlaps, patterns of all specimens."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from modeharvest.validation.studies.modes import (
 
 
 def parameters_summary(measured: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: a₁, and how far its wave vectors and phases are from Eq. (mode)."""
+    """A row for each specimen: a₁; deviations of wave vectors and phases from Eq. (mode)."""
     off, best = 100.0 * deviations(measured), 100.0 * deviations(measured, "best_")
     sds = [f"{name}_sd_model_error" for name in PARAMETERS]
     sd = 100.0 * measured[sds].set_axis(PARAMETERS, axis=1)
@@ -48,7 +48,7 @@ def parameters_summary(measured: pd.DataFrame) -> pd.DataFrame:
 
 
 def parameters_table(measured: pd.DataFrame) -> pd.DataFrame:
-    """A row for each parameter of each specimen, phases in shares of l."""
+    """A row for each parameter of each specimen; phases are divided by l."""
     rows = [
         {"varied": row["varied"], "level": row["level"], "d/l": row["ratio"], "parameter": name,
          "Eq. (mode)": ideal, "measured": row[name],
@@ -64,17 +64,17 @@ def parameters_table(measured: pd.DataFrame) -> pd.DataFrame:
 _WAVE_COLOURS = {"a2": style.BLUE, "a3": style.GREEN, "a4": style.GOLD, "a5": style.RED}
 _PHASES = {"a6": style.BLUE, "a7": style.RED}
 _IDEAL = dict(zip(PARAMETERS, IDEAL, strict=True))
-"""Eq. (mode) with a solid junction at the origin; phases in shares of l."""
-_PATTERN_END, _ERROR_END = 0.15, 0.03  # of the colours, in l
-_PAGE, _WIDEST = 8.9, 1.7  # of all specimens, and of one [in]
+"""Parameters of Eq. (mode) with a solid junction at the origin; phases divided by l."""
+_PATTERN_END, _ERROR_END = 0.15, 0.03  # ends of the colour scales [l]
+_PAGE, _WIDEST = 8.9, 1.7  # width of all specimens together, largest width of one [in]
 _ROWS = ("truth − v₀", "measured v₁φ₁", "truth − IDIC")
 
 
 def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], label: str) -> Figure:
     """Draw the modes' parameters: measured with error bars, best fit, infinite lattice.
 
-    ``done``: the specimens. ``at``: (n,) where each is on the axis. ``ticks``: its name there; none
-    for an axis of numbers. ``label``: of the axis.
+    ``done``: a row for each specimen. ``at``: (n,) their positions on the horizontal axis.
+    ``ticks``: their names, empty for a numerical axis. ``label``: label of the axis.
     """
     drawn = style.figure(9.6, 3.1 if not len(ticks) else 3.9)
     aspect, waves, phases = drawn.subplots(1, 3)
@@ -100,7 +100,7 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
 
 
 def _limit(axes: Axes, done: pd.DataFrame, names: Iterable[str]) -> None:
-    """Show all values, and error bars as far as they don't hide all else [%]."""
+    """Limit an axis [%] so that all values are visible; much longer error bars are cut off."""
     off = [done[prefix + name] - _IDEAL[name] for name in names for prefix in ("", "best_")]
     bars = 2.0 * done[[f"{name}_sd_model_error" for name in names]]
     end = 100.0 * max(1.2 * float(np.abs(off).max()), 2.5 * float(bars.median().max()))
@@ -108,7 +108,7 @@ def _limit(axes: Axes, done: pd.DataFrame, names: Iterable[str]) -> None:
 
 
 def _parameter(axes: Axes, done: pd.DataFrame, at: FloatArray, name: str, colour: str) -> None:
-    """Draw one parameter's deviation from the ideal one [%]: dots measured, rings best fit."""
+    """Draw a parameter's deviations from the ideal [%]: dots measured, ± 2 sd; rings best fit."""
     measured, best = (100.0 * (done[key] - _IDEAL[name]) for key in (name, f"best_{name}"))
     error = 200.0 * done[f"{name}_sd_model_error"]
     label = "measured" if name == "a1" else f"a{'₀₁₂₃₄₅₆₇'[int(name[1])]}"
@@ -137,7 +137,7 @@ _OVERLAPS = {
 
 
 def draw_overlaps(done: pd.DataFrame) -> Figure:
-    """Draw overlaps against d/l, with the infinite lattice's and the specimen's; strains beside."""
+    """Draw overlaps with the lattice's mode and the specimen's pattern, and strains, over d/l."""
     drawn = style.figure(9.6, 2.9)
     for axes, (title, columns) in zip(drawn.subplots(1, 3), _OVERLAPS.items(), strict=True):
         for key, (text, look) in columns.items():
@@ -152,9 +152,9 @@ def draw_overlaps(done: pd.DataFrame) -> Figure:
 
 
 def draw_patterns(specimens: Mapping[str, SpecimenPatterns]) -> Figure:
-    """Draw patterns side by side: the truth, what was measured of it, and the error.
+    """Draw the true pattern, the measured one and the error, the specimens side by side.
 
-    ``specimens`` are by the text above each.
+    ``specimens``: by the title of their column. The component along y is drawn.
     """
     each = min(_WIDEST, _PAGE / len(specimens))
     window = 2.02 * np.max([np.abs(p.mesh.nodes + p.displacement).max(axis=0)
@@ -187,7 +187,7 @@ def draw_patterns(specimens: Mapping[str, SpecimenPatterns]) -> Figure:
 
 
 def report_modes(found: ModesAnalysis, seeds: str) -> Findings:
-    """The modes' parameters and overlaps, against d/l and all else, and the patterns."""
+    """The modes' parameters and overlaps, against d/l and other variations, and the patterns."""
     ran, measured, sizes = found.ran, found.measured, found.sizes
     strains = {name: 100.0 * ran[name] for name in ran if name.endswith("strain")}
     values = _of_sizes(sizes) if len(sizes) else {}
@@ -215,18 +215,18 @@ def report_modes(found: ModesAnalysis, seeds: str) -> Findings:
 
 
 def _percent(values: Any) -> str:
-    """The largest size of some values, no smaller than anyone cares for."""
+    """The largest magnitude of some values [-] as text [%], at least 0.001 %."""
     return f"{max(0.001, 100.0 * float(np.max(np.abs(values)))):.2g} %"
 
 
 def _between(values: pd.Series) -> str:
-    """From the least to the largest of some overlaps; one that is alone by itself."""
+    """The range of some overlaps as text; one number if both ends read the same."""
     ends = dict.fromkeys(f"{value:.4f}" for value in (values.min(), values.max()))
     return " to ".join(ends)
 
 
 def _of_sizes(sizes: pd.DataFrame) -> dict[str, object]:
-    """What texts and key numbers say of the specimens that differ in d/l."""
+    """Values of the texts and key numbers on the specimens that differ in d/l only."""
     apart, errors, ratio = standardised_errors(sizes), sizes["measurement_error_px"], sizes["ratio"]
     overlaps = [key for columns in list(_OVERLAPS.values())[:2] for key in columns]
 
@@ -246,7 +246,7 @@ def _of_sizes(sizes: pd.DataFrame) -> dict[str, object]:
 
 
 def _of_the_others(measured: pd.DataFrame) -> list[str]:
-    """How far the mode moves with l and with the material."""
+    """Sentences on the changes of the mode with l and with the material."""
     base, text = measured[measured["varied"] == "base"], []
     for varied, what in (("l", "size of the cells"), ("material", "material")):
         part = measured[measured["varied"] == varied]
@@ -275,7 +275,7 @@ def _of_graded(measured: pd.DataFrame) -> list[str]:
 
 
 def _not_observable_text(ran: pd.DataFrame) -> list[str]:
-    """Specimens without a measured pattern, or in an unstable state."""
+    """Remarks on specimens without a measured pattern, unstable, or not simulated completely."""
     text = []
     for _, row in ran.iterrows():
         name, remarks = f"{row['varied']} {row['level']}".strip(), []
@@ -296,7 +296,7 @@ def _not_observable_text(ran: pd.DataFrame) -> list[str]:
 
 
 def _of_strains(ran: pd.DataFrame) -> list[str]:
-    """Critical strains of the specimens against their lattices'."""
+    """A sentence on critical strains of specimens over those of their infinite lattices."""
     known = ran[(ran["first"] == "pattern") & ~ran["varied"].str.startswith("graded")]
     both = known.dropna(subset=["lattice_pattern_strain"])
     if not len(both):
@@ -326,7 +326,7 @@ def _figures(
 
 
 def _patterns(rows: pd.DataFrame, folder: Path) -> Callable[[], Figure]:
-    """Draws the patterns of these specimens."""
+    """A function that draws the patterns of these specimens."""
     shown = {}
     for _, row in rows.iterrows():
         is_size = row["varied"] in ("base", "d/l")

@@ -1,4 +1,4 @@
-"""Report of a noise study: scatter against its bounds, bias, coverage, maps."""
+"""Report of a noise study: errors over the Cramér–Rao bound, bias, coverage, maps."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ CAUSE_LABELS = {
     "curvature": "and the cost’s curvature",
     "least": "and the noise’s gradient in w",
 }
-"""What each of the causes is called."""
+"""Labels of the causes in tables and figures; each includes all before it."""
 
 
 def summary_table(
     levels: Levels, ours: Levels, soft: Levels, pair: VirtualImagePair
 ) -> pd.DataFrame:
-    """A row for each level and quantity; error bars by three different covariances."""
+    """A row for each noise level and quantity, with coverage by three different covariances."""
     px = pair.images.grid.pixel_size
     everything = np.ones(pair.ansatz.size, dtype=np.bool_)
     families = {"all unknowns": everything} | {
@@ -76,7 +76,7 @@ def summary_table(
 
 
 def with_errors(summary: pd.DataFrame) -> pd.DataFrame:
-    """The same with values and their standard errors together."""
+    """The table of :func:`summary_table` with each value and its standard error in one cell."""
     read, last = pd.DataFrame(), ""
     for name in summary:
         if name.startswith("±"):
@@ -89,7 +89,7 @@ def with_errors(summary: pd.DataFrame) -> pd.DataFrame:
 
 
 def causes_table(found: NoiseAnalysis) -> pd.DataFrame:
-    """Rms standard deviation or error over the bound, by causes and as measured; by fields."""
+    """Rms errors of the fields over their bound: predicted, cause by cause, and measured [-]."""
     levels = found.against["bound"]
     first = levels[min(levels)]
     rows: list[dict[str, Any]] = []
@@ -108,7 +108,7 @@ def causes_table(found: NoiseAnalysis) -> pd.DataFrame:
 
 
 def unknowns_table(levels: Levels, ours: Levels, pair: VirtualImagePair) -> pd.DataFrame:
-    """A row for each unknown and level."""
+    """A row for each noise level and unknown."""
     ansatz = pair.ansatz
     parts = []
     for level, found in sorted(levels.items()):
@@ -123,7 +123,7 @@ def unknowns_table(levels: Levels, ours: Levels, pair: VirtualImagePair) -> pd.D
 
 
 def maps_table(levels: Levels, ours: Levels, points: FieldPoints) -> pd.DataFrame:
-    """A row for each level, field and point; vectors' components together."""
+    """A row for each noise level, field and point, with a vector's components combined."""
     parts = []
     for level, found in sorted(levels.items()):
         for name in PARTS:
@@ -140,7 +140,7 @@ def maps_table(levels: Levels, ours: Levels, points: FieldPoints) -> pd.DataFram
 
 
 def _unknown_families(pair: VirtualImagePair) -> dict[str, NDArray[np.bool_]]:
-    """Which unknowns are those of v0, of v1 and of phi1."""
+    """(n,) masks of the unknowns that belong to v0, v1 and phi1, by these names."""
     names = np.array(pair.ansatz.names)
     heads = {"v0": "v0", "v1": "v1[", "phi1": "phi1."}
     families = {k: np.char.startswith(names, head) for k, head in heads.items()}
@@ -166,7 +166,7 @@ _LEVELS = {
 
 
 def draw_causes(causes: pd.DataFrame) -> Figure:
-    """Draw rms over bound: what one cause after another predicts, and what is measured."""
+    """Draw rms errors over the bound: predicted with more and more causes, and measured."""
     place = np.arange(len(causes))
     predicted = causes["what"].str.startswith("measured").argmax()
     drawn, axes = curve("", "rms / bound [-]", WIDE, below=0.55)
@@ -183,7 +183,7 @@ def draw_causes(causes: pd.DataFrame) -> Figure:
 
 
 def draw_levels(levels: Mapping[float, Mapping[str, PairedErrors]], what: str) -> Figure:
-    """Draw one of "ratio", "bias" and "coverage" of the fields over the level of noise."""
+    """Draw the fields' "ratio", "bias" or "coverage", given as ``what``, over the noise level."""
     at = np.array(sorted(levels))
     label, target = _LEVELS[what]
     drawn, axes = _over_noise(at, label, target)
@@ -195,7 +195,7 @@ def draw_levels(levels: Mapping[float, Mapping[str, PairedErrors]], what: str) -
 
 
 def draw_bars(kinds: Mapping[str, Mapping[float, Mapping[str, PairedErrors]]]) -> Figure:
-    """Draw how many unknowns are in intervals by one covariance and another."""
+    """Draw coverage of the unknowns' 95 % intervals over the noise level, by covariance."""
     at = np.array(sorted(next(iter(kinds.values()))))
     drawn, axes = _over_noise(at, _COVERAGE, 0.95)
     for (label, levels), look in zip(kinds.items(), SERIES.values(), strict=False):
@@ -206,7 +206,7 @@ def draw_bars(kinds: Mapping[str, Mapping[float, Mapping[str, PairedErrors]]]) -
 
 
 def _over_noise(at: FloatArray, label: str, target: float) -> tuple[Figure, Axes]:
-    """Empty axes of something over the levels of noise, with its expected value."""
+    """Empty axes over the noise levels ``at`` [-], with a line at the value ``target``."""
     drawn, axes = curve("noise [% of full scale]", label, SMALL)
     axes.axhline(target, color=style.MUTED, linestyle=":", linewidth=1)
     axes.set_xscale("log")
@@ -224,7 +224,7 @@ def _estimates(
 
 
 def draw_unknowns(pairs: PairedErrors, names: Sequence[str]) -> Figure:
-    """Draw each unknown's rms error and coverage."""
+    """Draw each unknown's rms error over the predicted one, and its coverage."""
     count = pairs.errors.shape[0] * 2
     scatter, spread = 2.0 / np.sqrt(2.0 * count), 2.0 * np.sqrt(0.95 * 0.05 / count)
     drawn = style.figure(9.6, 3.4)
@@ -236,7 +236,7 @@ def draw_unknowns(pairs: PairedErrors, names: Sequence[str]) -> Figure:
     below.axhspan(0.95 - spread, top, color=style.GREEN, alpha=0.15, linewidth=0)
     below.plot(pairs.covered, ".", color=style.GREEN)
     below.set_ylabel("coverage [-]")
-    firsts: dict[str, int] = {}  # where the unknowns of v0x, v0y, v1 and phi1 begin
+    firsts: dict[str, int] = {}  # index of the first unknown of v0x, v0y, v1, phi1
     for k, name in enumerate(names):
         firsts.setdefault(name.split("[")[0].split(".")[0], k)
     below.set_xticks(list(firsts.values()), [_FAMILIES.get(name, name) for name in firsts])
@@ -246,7 +246,7 @@ def draw_unknowns(pairs: PairedErrors, names: Sequence[str]) -> Figure:
 
 
 def draw_maps(parts: Mapping[str, PairedErrors], points: FieldPoints) -> Figure:
-    """Draw maps of the fields' scatter, of its ratio to the least and of their coverage."""
+    """Draw maps of the fields' rms error, of its ratio to the predicted one, and of coverage."""
     grid = points.pair.images.grid
     x, y = grid.x[points.cols], grid.y[points.rows]
     extent = (float(x[0]), float(x[-1]), float(y[-1]), float(y[0]))
@@ -278,7 +278,7 @@ def draw_maps(parts: Mapping[str, PairedErrors], points: FieldPoints) -> Figure:
 
 
 def report_noise(found: NoiseAnalysis, seeds: str) -> Findings:
-    """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
+    """Rms error, bias and coverage of the unknowns and of the fields, and maps."""
     levels, ours, soft = (found.against[cause] for cause in ("bound", "least", HESSIAN_CORRECTED))
     shown, lowest = sorted(levels)[len(levels) // 2], min(levels)
     summary = summary_table(levels, ours, soft, found.points.pair)
@@ -336,6 +336,6 @@ def report_noise(found: NoiseAnalysis, seeds: str) -> Findings:
 
 
 def _listed(things: Iterable[object]) -> str:
-    """With commas, and an "and" before the last."""
+    """The items as text, separated by commas, with "and" before the last one."""
     *first, last = map(str, things)
     return f"{', '.join(first)} and {last}" if first else last

@@ -1,4 +1,4 @@
-"""Report of a resolution study: transfer by degree, noise against resolution, pass band."""
+"""Report of a resolution study: transfer by degree, noise over resolution, pass band."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from modeharvest.validation.studies.transfer import (
 _SIZE = (4.6, 3.3)  # [in]
 _DEGREES: Colormap = mpl.colormaps["viridis"]
 _KEPT = 0.85
-"""Share of a wave that is found, from which on images are set against best fits apart [-]."""
+"""Images are compared with best fits separately for waves of which these find more [-]."""
 
 
 def noise_floors(done: pd.DataFrame, spec: ResolutionSpec) -> pd.DataFrame:
-    """Scatter under noise against what each result's covariance predicts, and the bound.
+    """Noise floors: the bound, predictions by each result's covariance, Monte Carlo errors.
 
-    The rms over realisations and material [px], by motion, degree and quantity.
+    A row for each motion, degree and quantity; rms over realisations and material [10⁻³ px].
     """
     rows = []
     for motion, what in MOTIONS.items():
@@ -65,7 +65,7 @@ def noise_floors(done: pd.DataFrame, spec: ResolutionSpec) -> pd.DataFrame:
 def measured_waves(
     done: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
 ) -> pd.DataFrame:
-    """Shares of waves found in images and by best fits, over both phases."""
+    """Measured shares of waves in images and in best fits [-], averaged over both phases."""
     waves, rows = done[done["task"] == "wave"], []
     pitch = spec.buckled.specimen.pitch
     for (part, axis, period), both in waves.groupby(["part", "axis", "period"]):
@@ -84,7 +84,7 @@ def measured_waves(
 def draw_transfer(
     part: str, curves: TransferCurves, waves: pd.DataFrame, spec: ResolutionSpec
 ) -> Figure:
-    """Draw T over the period for waves of a part along both axes, degrees in colours."""
+    """Draw T over the period for waves of a part along x and y; the colour is the degree."""
     pitch = spec.buckled.specimen.pitch
     degrees = sorted({key[2] for key in curves.own})
     drawn = style.figure(9.4, 3.1)
@@ -111,7 +111,7 @@ def draw_transfer(
 
 
 def draw_indicators(degrees: Sequence[DegreeResolution], local: float) -> Figure:
-    """Draw noise floors over l10 for all degrees, and the line of an affine subset."""
+    """Draw n over l10 for all degrees, and the line n l10 = ``local`` [px²] of affine subsets."""
     drawn, axes = curve("l₁₀ % [px]", "noise floor n [10⁻³ px]", _SIZE)
     ends = []
     for part, floor, colour in (("v0", "v0", style.BLUE), ("v1", "v1phi1", style.RED)):
@@ -133,7 +133,7 @@ def draw_indicators(degrees: Sequence[DegreeResolution], local: float) -> Figure
 
 
 def draw_passband(passband: Passband) -> Figure:
-    """Draw what is found of patterns of other wavelengths, beside the mode and instead of it."""
+    """Draw measured shares of patterns of other wavelengths: added to the mode, or replacing it."""
     drawn, axes = curve("wave numbers over the mode's [–]", "amplitude ratio [–]", _SIZE)
     axes.axhline(KEPT, color=style.MUTED, linestyle=":", linewidth=1)
     axes.plot(passband.stretch, passband.added, color=style.BLUE, label="a small one beside it")
@@ -146,15 +146,15 @@ def draw_passband(passband: Passband) -> Figure:
 
 
 def _colour(degree: int, degrees: Sequence[int]) -> tuple[float, ...]:
-    """From dark to bright with the degree."""
+    """RGBA colour of a degree, brighter for higher ones."""
     low, high = min(degrees), max(degrees)
     return _DEGREES(0.9 * (degree - low) / max(1, high - low))
 
 
 def _text(found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame) -> tuple[str, ...]:
-    """The findings, the most important first.
+    """The findings in sentences, the most important first.
 
-    ``waves``, ``floors``: tables: images against best fits, scatter against covariance.
+    ``waves``, ``floors``: tables of :func:`measured_waves` and :func:`noise_floors`.
     """
     buckled, chosen, band = found.spec.buckled, found.chosen, found.passband
     pitch = buckled.specimen.pitch / buckled.pixel_size
@@ -185,7 +185,7 @@ def _text(found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame) 
 def _measured_text(
     found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame
 ) -> list[str]:
-    """What correlated images add to best fits and theory, where there are any."""
+    """Sentences on correlated images, compared with best fits and covariances; or none."""
     text = []
     if len(waves):
         off, kept = 100 * waves["difference"].abs(), waves["best fit"] >= _KEPT
@@ -203,7 +203,7 @@ def _measured_text(
 
 
 def report_resolution(found: ResolutionAnalysis, seeds: str) -> Findings:
-    """Transfer, noise floors and indicators by degree."""
+    """Transfer, noise floors and indicators by polynomial degree."""
     spec, curves, degrees = found.spec, found.curves, found.degrees
     floors = noise_floors(found.rows, spec)
     waves = measured_waves(found.rows, spec, curves)
@@ -238,7 +238,7 @@ def report_resolution(found: ResolutionAnalysis, seeds: str) -> Findings:
 
 
 def _by_degree(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.DataFrame:
-    """A row for each degree."""
+    """A row for each degree: l10, noise floors n, and indicators n l10."""
     pitch_px = spec.buckled.specimen.pitch / spec.buckled.pixel_size
     rows = []
     for d in degrees:
@@ -252,7 +252,7 @@ def _by_degree(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.Data
 
 
 def _finest(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.DataFrame:
-    """A row for each degree and wave: l10 in px, in cells, and over what the wave runs through."""
+    """A row for each degree and wave: l10 in px, mm, cells, and % of the length of its domain."""
     b, rows = spec.buckled, []
     lengths = {"v0": b.specimen.half_size, "v1": b.specimen.cellular_half_size}
     for d in degrees:
@@ -268,7 +268,7 @@ def _finest(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.DataFra
 
 
 def _transfer_table(curves: TransferCurves, spec: ResolutionSpec) -> pd.DataFrame:
-    """A row for each curve and period."""
+    """A row for each transfer curve and period."""
     px = spec.buckled.pixel_size
     parts = [
         pd.DataFrame({

@@ -22,7 +22,7 @@ from modeharvest.validation.studies.robustness import (
 
 
 def by_radius(moved: pd.DataFrame) -> pd.DataFrame:
-    """Success against the radius of the perturbations."""
+    """A row for each radius of the perturbations: guesses that converge to the same minimum."""
     rows = []
     for radius, part in moved.groupby("radius"):
         good, count = int(part["same"].sum()), len(part)
@@ -44,7 +44,7 @@ def by_radius(moved: pd.DataFrame) -> pd.DataFrame:
 
 
 def other_minima(moved: pd.DataFrame) -> pd.DataFrame:
-    """Each initial guess that leads to another minimum; its number and the seed make it again."""
+    """Guesses that fail or lead to another minimum; reproducible by number, radius and seed."""
     others = moved[~moved["same"]].sort_values(["radius", "start"])
     return pd.DataFrame({
         "off by up to [%]": 100.0 * others["radius"],
@@ -58,7 +58,7 @@ def other_minima(moved: pd.DataFrame) -> pd.DataFrame:
 
 
 def _histogram(name: str, limit: float, label: str, table: pd.DataFrame) -> Figure:
-    """Count initial guesses on a logarithmic axis that reaches the limit, which is marked."""
+    """Histogram of the initial guesses over a column on a logarithmic axis; a line at ``limit``."""
     drawn, axes = curve(label, "initial guesses", SMALL)
     values = np.maximum(table[name].dropna().to_numpy(), 1e-12)
     low, high = np.floor(np.log10(values.min())), np.ceil(np.log10(max(values.max(), limit)))
@@ -69,13 +69,13 @@ def _histogram(name: str, limit: float, label: str, table: pd.DataFrame) -> Figu
 
 
 def draw_distances(table: pd.DataFrame) -> Figure:
-    """Draw how far from the standard initial guess' result the others' are."""
+    """Draw a histogram of the results' distances from that of the standard initial guess."""
     label = "distance from the standard guess’ displacement [px rms]"
     return _histogram("distance_px", SAME_PX, label, table)
 
 
 def draw_epsilons(table: pd.DataFrame) -> Figure:
-    """Draw the paper's error of each initial guess."""
+    """Draw a histogram of the paper's error epsilon of all initial guesses."""
     drawn = _histogram("epsilon_percent", OUTLIER_PERCENT, "ε [%]", table)
     drawn.axes[0].axvline(
         PUBLISHED["mean_epsilon_percent"], color=style.RED, linestyle=":", linewidth=1
@@ -84,7 +84,7 @@ def draw_epsilons(table: pd.DataFrame) -> Figure:
 
 
 def draw_basin(rows: pd.DataFrame) -> Figure:
-    """Draw success over how far off the mode's parameters are."""
+    """Draw the success rate over the radius of the perturbations, with 95 % intervals."""
     drawn, axes = curve("mode parameters off by up to [%]", "same minimum [%]", SMALL)
     x, y = rows["off by up to [%]"], rows["success [%]"]
     spread = np.clip([y - rows["95 % from"], rows["to [%]"] - y], 0.0, None)
@@ -95,7 +95,7 @@ def draw_basin(rows: pd.DataFrame) -> Figure:
 
 
 def draw_strains(strains: pd.DataFrame) -> Figure:
-    """Draw where initial guesses with a wrong strain end."""
+    """Draw distances of guesses with a wrong strain, and of their results, over its error."""
     rows = strains.sort_values("strain_percent")
     off = rows["strain_percent"]
     drawn, axes = curve("strain of v₀’s initial guess off by [%]", "distance [px rms]", SMALL)
@@ -112,7 +112,7 @@ def draw_strains(strains: pd.DataFrame) -> Figure:
 
 
 def report_robustness(found: RobustnessAnalysis, seeds: str) -> Findings:
-    """Success, epsilon and distance, and the basin's picture."""
+    """Success rate, epsilon, distances, and the basin of convergence."""
     asked, statistics = found.at_radius, found.statistics
     strains = found.strains.assign(strain_percent=100.0 * found.strains["strain_error"])
     basin = by_radius(found.moved[found.moved["radius"] > 0.0])
@@ -154,7 +154,7 @@ def report_robustness(found: RobustnessAnalysis, seeds: str) -> Findings:
 
 
 def _basin_text(basin: pd.DataFrame) -> str:
-    """Up to where all converge to the same minimum."""
+    """Text: the largest radius up to which all guesses converge, and the one with fewest."""
     full = basin["same minimum"] == basin["initial guesses"]
     sure = basin.loc[full.cummin(), "off by up to [%]"]
     text = text_of("robustness-nowhere")
@@ -167,7 +167,7 @@ def _basin_text(basin: pd.DataFrame) -> str:
 
 
 def _undetected(moved: pd.DataFrame) -> list[str]:
-    """How many other minima the paper's error does not detect."""
+    """A sentence on other minima that the paper's error does not detect; none if there are none."""
     others = moved[~moved["same"] & moved["distance_px"].notna()]
     unseen = others[others["epsilon_percent"] <= OUTLIER_PERCENT]["distance_px"]
     if not len(unseen):

@@ -1,4 +1,4 @@
-"""Report of systematic errors: which factor matters, and how much."""
+"""Report of a systematic study: effect of each factor on the errors."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ ERROR_LABELS = {
 
 MOVED = "moved from the base [px]"
 _FAR, _NEAR = 0.1, 0.01
-"""Factors that move the measurement by more, or by less, are listed apart [px]."""
+"""Factors are listed in three groups by how far they move the measurement [px]."""
 
 
 def by_level(found: SystematicAnalysis) -> pd.DataFrame:
-    """A row for each factor and level, the base's among them: means over the speckles."""
+    """A row for each factor and level, including the base's: means over the speckles."""
     done = found.rows
     base = done[done["factor"] == BASE]
     rows = []
@@ -57,9 +57,9 @@ def by_level(found: SystematicAnalysis) -> pd.DataFrame:
 
 
 def by_factor(levels: pd.DataFrame) -> pd.DataFrame:
-    """A row for each factor: its smallest and its largest error, the most important first.
+    """A row for each factor, with its smallest and largest errors.
 
-    Levels at which not all converged have no part in it.
+    Factors that move the measurement most come first. Levels with failed convergence are ignored.
     """
     measurement, model = (ERROR_LABELS[f"{name}_error_px"] for name in ("measurement", "model"))
     moved = f"largest, {MOVED}"
@@ -92,7 +92,7 @@ _COLUMNS = 3
 
 
 def report_systematic(found: SystematicAnalysis, seeds: str) -> Findings:
-    """Errors against each factor, as curves and tables."""
+    """Errors over the levels of each factor, as curves and tables."""
     levels = by_level(found)
     spans = by_factor(levels)
     first, base = spans.iloc[0], found.base
@@ -121,7 +121,7 @@ def _short(factor: str) -> str:
 
 
 def _text(levels: pd.DataFrame, spans: pd.DataFrame) -> list[str]:
-    """The factors by how far they move the measurement, and what did not converge."""
+    """Sentences: factors grouped by how far they move the measurement; levels not converged."""
     text, moved = [], spans[f"largest, {MOVED}"]
     for heading, part in {
         f"These move the measurement by more than {_FAR:g} px": moved > _FAR,
@@ -139,7 +139,7 @@ def _text(levels: pd.DataFrame, spans: pd.DataFrame) -> list[str]:
 
 
 def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Figure:
-    """Draw small curves, one for each factor, on a common scale."""
+    """Draw the errors over the levels of each factor, in small plots with a common scale."""
     rows = -(-len(bases) // _COLUMNS)
     drawn = style.figure(9.6, 2.3 * rows)
     grid = drawn.subplots(rows, _COLUMNS, squeeze=False, sharey=True).ravel()
@@ -148,7 +148,7 @@ def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Fig
     for axes, (name, at_base) in zip(grid, bases.items(), strict=False):
         part = levels[levels["name"] == name]
         for column, look in _CURVES.items():
-            shown = part[part[column] > 0.0]  # the base is not moved from itself
+            shown = part[part[column] > 0.0]  # the base has a change of 0
             axes.plot(shown["number"], shown[column], linewidth=1, markersize=4, label=column,
                       **look)  # fmt: skip
         _label_axes(axes, part, at_base)

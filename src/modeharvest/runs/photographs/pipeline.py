@@ -27,9 +27,9 @@ import numpy as np
 
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.finite_element.continued import continued
 from modeharvest.idic.finite_element.files import Given, read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field, write_field
@@ -44,12 +44,11 @@ from modeharvest.idic.photograph.measure import (
     warped_back,
     with_brightness,
 )
-from modeharvest.idic.photograph.plain import (
+from modeharvest.idic.photograph.plain.measure import measure_contours, write_shapes
+from modeharvest.idic.photograph.plain.surface import (
     MaterialContours,
     away_from_cuts,
-    measure_contours,
     plain_surface,
-    write_shapes,
 )
 from modeharvest.idic.photograph.speckled_edges import (
     ByContours,

@@ -18,9 +18,9 @@ from modeharvest.idic.local.field import LocalField, read_field, without_distort
 from modeharvest.idic.local.formats import frames_of
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
-from modeharvest.idic.photograph.matching import RigidMotion, rigid_motion
+from modeharvest.idic.photograph.matching.holes import RigidMotion, rigid_motion
 from modeharvest.idic.photograph.material import find_material, window_for
-from modeharvest.idic.photograph.plain import one_specimen, plain_surface
+from modeharvest.idic.photograph.plain.surface import one_specimen, plain_surface
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial, calibrate
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion

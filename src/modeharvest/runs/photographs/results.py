@@ -18,8 +18,8 @@ from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.holes import HoleLattice
-from modeharvest.idic.photograph.matching import RigidMotion
-from modeharvest.idic.photograph.plain import away_from_cuts
+from modeharvest.idic.photograph.matching.holes import RigidMotion
+from modeharvest.idic.photograph.plain.surface import away_from_cuts
 from modeharvest.idic.photograph.speckled_edges import ByContours
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.noise import CameraNoise

@@ -26,7 +26,7 @@ from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import SLOW_DEGREE, first_motion, fit_unknowns
 from modeharvest.idic.modes import ModeFamily, turning_family
 from modeharvest.idic.photograph.geometry import find_geometry, junction
-from modeharvest.idic.photograph.matching import matched_holes
+from modeharvest.idic.photograph.matching.holes import matched_holes
 from modeharvest.idic.photograph.material import find_material, window_for
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions

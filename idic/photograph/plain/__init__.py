@@ -1,0 +1,1 @@
+"""Photographs of a plain specimen, without speckle: its material, its contours, holes and dots."""
