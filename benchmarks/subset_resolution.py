@@ -40,7 +40,7 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.report.grades import star_report, write_grading
-from modeharvest.report.model import print_report
+from modeharvest.report.model.output import print_report
 from modeharvest.validation.scoring.star import Star, StarSet, StarSpec, image_name, make_star_set
 from modeharvest.validation.scoring.star_grades import (
     Attenuation,

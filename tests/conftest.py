@@ -112,13 +112,14 @@ def unrendered_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the figures of reports out, where a test is not about them and others compose them."""
-    from modeharvest.report import model
+    from modeharvest.report.model import output
+    from modeharvest.report.model.content import ReportFigure
     from modeharvest.util.progress import Progress, counted, silent
 
-    def blank(figures: Iterable[model.ReportFigure], progress: Progress = silent) -> dict[str, str]:
+    def blank(figures: Iterable[ReportFigure], progress: Progress = silent) -> dict[str, str]:
         return {f.name: "<svg></svg>" for f in counted(list(figures), progress, "report")}
 
-    monkeypatch.setattr(model, "draw_figures", blank)
+    monkeypatch.setattr(output, "draw_figures", blank)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -183,9 +183,9 @@ def main() -> None:
     for module in _MODULES:
         if importlib.util.find_spec(module) is not None:  # gmsh may be missing
             importlib.import_module(module)
-    model = sys.modules["modeharvest.report.model"]
-    model.draw_figures = lambda figures, _: {f.name: "" for f in figures}  # type: ignore[attr-defined]
-    model.page_template()
+    output = sys.modules["modeharvest.report.model.output"]
+    output.draw_figures = lambda figures, _: {f.name: "" for f in figures}  # type: ignore[attr-defined]
+    output.page_template()
     numba.njit(lambda x: x)(0)  # has the compiler import the rest of itself; begins no threads
     assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
     gc.freeze()  # no attempt looks through what is there already

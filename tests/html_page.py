@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import pandas as pd
 
-from modeharvest.report.model import ReportTable
+from modeharvest.report.model.content import ReportTable
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 

@@ -349,7 +349,8 @@ def test_wildcards_may_be_absolute(place: Path, tmp_path: Path) -> None:
 
 
 def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    from modeharvest.report.model import Card, Report, ReportTable, Section, print_report
+    from modeharvest.report.model.content import Card, Report, ReportTable, Section
+    from modeharvest.report.model.output import print_report
 
     table = ReportTable("[/t]", ["[b]"], [["[/b]"]], on_terminal=True)
     section = Section("s", "S", Card.tabular(table))

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from modeharvest.report.experiment import experiment_report
 from modeharvest.report.explore import LENGTH_STEP, Packer
 from modeharvest.report.figures import style
-from modeharvest.report.model import write_page
+from modeharvest.report.model.output import write_page
 
 FLOATS = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.patches import PathPatch
 from PIL import Image
 from scipy.io import loadmat
 from test_cli import called, error_line
@@ -17,7 +18,9 @@ from modeharvest.idic.finite_element.files import Given, write_result
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.photograph.finished import FinishedRun
 from modeharvest.imaging.photographs.files import write_image
-from modeharvest.report.figures.on_photographs import write_pdf
+from modeharvest.report.figures.maps import ColourScale
+from modeharvest.report.figures.on_photographs import draw_on_photograph, write_pdf
+from modeharvest.report.figures.style import SIZE, style
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import write_json
 
@@ -119,6 +122,19 @@ def test_a_field_is_animated_on_the_photographs(run: Path, monkeypatch: pytest.M
     pytest.importorskip("imageio_ffmpeg")
     assert called(monkeypatch, "animate", run, "--as", "mp4") == 0
     assert (run / "u.mp4").stat().st_size > 1000
+
+
+def test_a_specimen_that_leaves_the_picture_is_cut_at_its_border() -> None:
+    """Its edge, too, would be drawn over the colour bar."""
+    away = result(affine(STRETCH) + [4.0, 0.0])  # the picture is 12 mm wide
+    scale = ColourScale(SIZE, 0.0, 1.0, "mm")
+    drawn = draw_on_photograph(away, np.zeros(len(MESH.nodes)), scale, None)
+    (axes,) = drawn.axes
+    with style():
+        drawn.draw_without_rendering()
+        (edge,) = (patch for patch in axes.patches if isinstance(patch, PathPatch))
+        right = edge.get_tightbbox().x1
+    assert right <= axes.get_window_extent().x1 + 1.0
 
 
 def test_fields_are_printed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

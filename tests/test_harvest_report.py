@@ -33,7 +33,7 @@ from modeharvest.report.figures.photographs import (
     photograph_states,
     shown_frames,
 )
-from modeharvest.report.model import write_page
+from modeharvest.report.model.output import write_page
 from modeharvest.report.photographs import (
     key_numbers,
     mode_cards,

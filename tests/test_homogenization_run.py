@@ -25,7 +25,7 @@ from modeharvest.idic.modes import square_family
 from modeharvest.idic.result import Covariance, Result
 from modeharvest.idic.spectra.mode_family import FoundFamily, write_family
 from modeharvest.report.homogenization import homogenization_report
-from modeharvest.report.model import print_report
+from modeharvest.report.model.output import print_report
 from modeharvest.runs.homogenization.case import FileMode, HomogenizationCase
 from modeharvest.runs.homogenization.pipeline import HomogenizationRun
 from modeharvest.runs.homogenization.results import aligned, not_reached

@@ -20,7 +20,7 @@ from modeharvest.fem.bloch.modes import read_modes
 from modeharvest.fem.lattice.options import CriticalSearch
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.report.lattice import lattice_report
-from modeharvest.report.model import print_report
+from modeharvest.report.model.output import print_report
 from modeharvest.runs import run
 from modeharvest.runs.lattice.case import (
     DispersionPlan,

@@ -25,7 +25,7 @@ from modeharvest.report.lattice import (
     wave_name,
     waves_text,
 )
-from modeharvest.report.model import write_page
+from modeharvest.report.model.output import write_page
 from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField, summary_of
 
 pytestmark = pytest.mark.usefixtures("coarse_pictures")

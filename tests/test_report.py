@@ -26,16 +26,9 @@ from modeharvest.report.experiment import (
     snapshot_panels,
 )
 from modeharvest.report.figures import fits
-from modeharvest.report.model import (
-    KeyNumber,
-    Measured,
-    draw_figures,
-    fixed,
-    number,
-    print_report,
-    text_of,
-    write_page,
-)
+from modeharvest.report.model.content import KeyNumber
+from modeharvest.report.model.output import draw_figures, print_report, write_page
+from modeharvest.report.model.text import Measured, fixed, number, text_of
 
 
 def report(data: ExperimentData, folder: Path, summary: dict[str, Any]) -> str:

@@ -18,7 +18,7 @@ from scipy import ndimage
 from modeharvest.cli import root
 from modeharvest.idic.local.field import LocalField
 from modeharvest.imaging.photographs.files import read_image
-from modeharvest.report.model import number
+from modeharvest.report.model.text import number
 from modeharvest.runs.benchmark import grade_star
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json

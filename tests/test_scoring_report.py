@@ -25,7 +25,7 @@ from synthetic_benchmark import PIXEL, STRAIN
 from modeharvest.cli.root import main
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.report.model import number
+from modeharvest.report.model.text import number
 from modeharvest.validation.scoring import score as grades
 from modeharvest.validation.scoring import score as spectra
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth

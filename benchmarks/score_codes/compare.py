@@ -43,7 +43,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.report.grades import grading_report
-from modeharvest.report.model import print_report
+from modeharvest.report.model.output import print_report
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
 from modeharvest.runs.benchmark.standard import leaderboard
 from modeharvest.runs.case import Case, shipped_solution

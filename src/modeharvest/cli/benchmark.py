@@ -83,7 +83,7 @@ def score(
     the end, and the exit code is then 2.
     """
     from modeharvest.report.grades import grading_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.benchmark import declarations
     from modeharvest.runs.benchmark import score as score_fields
     from modeharvest.util.stages import exclusive
@@ -152,7 +152,7 @@ def resolution(
     and its --still. Writes report.html, resolution.json and resolution.csv to DIR.
     """
     from modeharvest.report.grades import star_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.benchmark import declarations, grade_star
     from modeharvest.util.stages import exclusive
 

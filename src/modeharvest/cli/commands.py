@@ -54,7 +54,7 @@ def run(
     "calibration" is the twin of a real experiment, and is measured from its photographs alone.
     """
     from modeharvest.report.experiment import experiment_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.report.photographs import photographs_report
 
     with _stages(case, out, solution, whole_field=whole_field) as stages:
@@ -119,7 +119,7 @@ def validate(
 ) -> None:
     """Compare the measurement with the truth: DIR/report.html and DIR/summary.json."""
     from modeharvest.report.experiment import experiment_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
 
     with _stages(case, out, solution, whole_field) as stages:
         summary = stages.validate()
@@ -165,7 +165,7 @@ def modes(case: CaseName, out: OutFolder) -> None:
 def _analyse(case: str, out: Path, whole: bool) -> None:
     """Analyse a lattice under progress bars, and print its report."""
     from modeharvest.report.lattice import lattice_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.lattice.case import LatticeCase
 
     checked = LatticeCase.read(case)
@@ -225,7 +225,7 @@ def harvest(
         return _watch(experiment, out, watch, until_still)
     if until_still is not None:
         raise InputError("expected --watch FOLDER beside --until-still, got none")
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.report.photographs import photographs_report
     from modeharvest.runs.photographs.pipeline import harvest as harvest_photographs
 
@@ -279,7 +279,7 @@ def measure(
     For example: modeharvest measure ref.tif def_*.tif --mask mask.png --out out/plate
     """
     from modeharvest.report.measure import measure_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.measure import measure as measure_images
     from modeharvest.runs.photographs.machine_log import LogTable
     from modeharvest.runs.photographs.sequence import FrameChoice
@@ -326,7 +326,8 @@ def study(
         raise InputError(
             "expected --workers or --scheduler, got both: a scheduler has workers of its own"
         )
-    from modeharvest.report.model import print_report, study_report
+    from modeharvest.report.model.content import study_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.study import StudyAnalysis, StudyCase
     from modeharvest.validation.workers import Workers
 

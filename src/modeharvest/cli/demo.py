@@ -68,7 +68,7 @@ def demo(
         summary = Run(case, out, progress, shipped_solution(CASE)).all()
     # The run has loaded these modules while kernels were compiled.
     from modeharvest.report.experiment import experiment_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
 
     print_report(experiment_report(summary), out)
     typer.echo("\n" + NEXT.format(case=CASE))

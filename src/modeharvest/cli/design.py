@@ -14,7 +14,7 @@ def design(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> Non
     virtual experiment; its table "design" states the wanted errors (docs/how-to/design.md).
     """
     from modeharvest.report.design import design_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.design import DesignCase
 
     checked = DesignCase.read(case)

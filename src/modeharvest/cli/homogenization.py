@@ -16,7 +16,7 @@ def homogenize(case: CaseName, out: OutFolder) -> None:
     paper's virtual experiment, which is run in DIR/experiment.
     """
     from modeharvest.report.homogenization import homogenization_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.homogenization.case import HomogenizationCase
 
     checked = HomogenizationCase.read(case)

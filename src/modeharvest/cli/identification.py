@@ -27,7 +27,7 @@ def identify(
     with 'modeharvest cases identify-twin > experiment.toml', a case that simulates its own data.
     """
     from modeharvest.report.identification import identification_report
-    from modeharvest.report.model import print_report
+    from modeharvest.report.model.output import print_report
     from modeharvest.runs.identification.case import IdentificationCase
     from modeharvest.runs.identification.pipeline import IdentificationRun
 

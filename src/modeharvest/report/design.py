@@ -12,16 +12,8 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures.curves import curve, plain_ticks
 from modeharvest.report.figures.style import INK, SIZE
-from modeharvest.report.model import (
-    Card,
-    KeyNumber,
-    Report,
-    ReportTable,
-    Section,
-    caption,
-    number,
-    text_of,
-)
+from modeharvest.report.model.content import Card, KeyNumber, Report, ReportTable, Section
+from modeharvest.report.model.text import caption, number, text_of
 from modeharvest.util.typed import headings
 from modeharvest.validation.design import DesignRanges, ExpectedErrors
 

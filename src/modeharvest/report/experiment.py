@@ -24,16 +24,18 @@ from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import draw_eigenvalues, draw_load
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field, draw_image
 from modeharvest.report.figures.whole_field import WholeMaps, whole_panel_numbers
-from modeharvest.report.model import (
+from modeharvest.report.model.content import (
     Card,
-    Cell,
     KeyNumber,
-    Mark,
-    Measured,
     Report,
     ReportFigure,
     ReportTable,
     Section,
+)
+from modeharvest.report.model.text import (
+    Cell,
+    Mark,
+    Measured,
     caption,
     material_text,
     number,

@@ -31,7 +31,7 @@ from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.fits import FittedState, S
 from modeharvest.report.figures.maps import MapFrame
 from modeharvest.report.figures.whole_field import middle_pixels
-from modeharvest.report.model import page_template
+from modeharvest.report.model.output import page_template
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.typed import picked
 from modeharvest.validation.scoring.score import Grading, Score

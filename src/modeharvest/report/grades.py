@@ -16,19 +16,16 @@ from modeharvest.report.explore import explored_scores
 from modeharvest.report.figures import maps, style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above, plain_ticks
-from modeharvest.report.model import (
+from modeharvest.report.model.content import (
     Card,
-    Cell,
     KeyNumber,
     Report,
     ReportFigure,
     ReportTable,
     Section,
-    caption,
-    number,
-    text_of,
-    write_page,
 )
+from modeharvest.report.model.output import write_page
+from modeharvest.report.model.text import Cell, caption, number, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import atomic, write_json
 from modeharvest.validation.scoring.score import (

@@ -10,19 +10,15 @@ import numpy as np
 
 from modeharvest.report.figures import homogenization as figures
 from modeharvest.report.figures.maps import ColourScale
-from modeharvest.report.model import (
+from modeharvest.report.model.content import (
     Card,
     KeyNumber,
-    Measured,
     Report,
     ReportFigure,
     ReportTable,
     Section,
-    caption,
-    material_text,
-    number,
-    text_of,
 )
+from modeharvest.report.model.text import Measured, caption, material_text, number, text_of
 from modeharvest.runs.homogenization.results import HomogenizationData, aligned
 from modeharvest.util.arrays import FloatArray
 

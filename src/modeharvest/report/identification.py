@@ -15,18 +15,15 @@ from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
 from modeharvest.report.figures.style import BLUE, EDGE, GOLD, RED
-from modeharvest.report.model import (
+from modeharvest.report.model.content import (
     Card,
     KeyNumber,
-    Measured,
     Report,
     ReportFigure,
     ReportTable,
     Section,
-    caption,
-    number,
-    text_of,
 )
+from modeharvest.report.model.text import Measured, caption, number, text_of
 
 Summary = Mapping[str, Any]
 _TEST = "{chi_squared:.4g} of {degrees_of_freedom}, p = {p_value:.2g}"

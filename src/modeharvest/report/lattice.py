@@ -17,14 +17,16 @@ from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import upward
 from modeharvest.report.figures import lattice as figures
 from modeharvest.report.figures.boundaries import LatticePatch
-from modeharvest.report.model import (
+from modeharvest.report.model.content import (
     Card,
     KeyNumber,
-    Mark,
     Report,
     ReportFigure,
     ReportTable,
     Section,
+)
+from modeharvest.report.model.text import (
+    Mark,
     caption,
     fixed,
     material_text,

@@ -16,17 +16,15 @@ from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field, draw_image
 from modeharvest.report.figures.on_photographs import draw_gauges_on, gauge_cards
 from modeharvest.report.figures.sequence import force_cards
-from modeharvest.report.model import (
+from modeharvest.report.model.content import (
     Card,
     KeyNumber,
     Report,
     ReportFigure,
     ReportTable,
     Section,
-    caption,
-    number,
-    text_of,
 )
+from modeharvest.report.model.text import caption, number, text_of
 from modeharvest.util.arrays import FloatArray, FloatImage
 
 Summary = Mapping[str, Any]

@@ -19,21 +19,15 @@ from modeharvest.report.figures.on_photographs import draw_gauges_on, gauge_card
 from modeharvest.report.figures.photographs import PhotographState
 from modeharvest.report.figures.sequence import force_cards
 from modeharvest.report.figures.whole_field import whole_cards, whole_panel_numbers
-from modeharvest.report.model import (
+from modeharvest.report.model.content import (
     Card,
-    Cell,
     KeyNumber,
-    Mark,
-    Measured,
     Report,
     ReportFigure,
     ReportTable,
     Section,
-    caption,
-    number,
-    percent,
-    text_of,
 )
+from modeharvest.report.model.text import Cell, Mark, Measured, caption, number, percent, text_of
 from modeharvest.runs.photographs.results import Harvest
 
 Summary = Mapping[str, Any]

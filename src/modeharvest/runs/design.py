@@ -68,7 +68,7 @@ class DesignRun(StagedRun[DesignCase]):
     def all(self) -> dict[str, Any]:
         """Write summary and report; returns the content of ``summary.json``."""
         from modeharvest.report.design import design_report
-        from modeharvest.report.model import write_page
+        from modeharvest.report.model.output import write_page
 
         require_writable(self.folder)
         with exclusive(self.folder):

@@ -174,7 +174,7 @@ class Run(StagedRun[Case]):
             with precompiling(ahead) as kernels:
                 solution = self.solved()
                 import_module("modeharvest.report.experiment")  # while kernels compile
-                import_module("modeharvest.report.model").page_template()
+                import_module("modeharvest.report.model.output").page_template()
                 kernels.wait("image", self.progress)
                 self.image()
                 kernels.wait("correlate", self.progress)
@@ -215,7 +215,7 @@ class Run(StagedRun[Case]):
             experiment_figures,
             experiment_report,
         )
-        from modeharvest.report.model import draw_figures, write_page
+        from modeharvest.report.model.output import draw_figures, write_page
 
         case, solution, results = self.case, self._solution(), self._results(images)
         is_whole = case.whole_field.measure

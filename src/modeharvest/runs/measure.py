@@ -327,7 +327,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             results = self.results()
             summary = self._summary(results)
             from modeharvest.report.measure import measure_report
-            from modeharvest.report.model import write_page
+            from modeharvest.report.model.output import write_page
 
             summary["gauges"] = [] if not gauges else reading_rows(
                 write_gauges(self.folder, gauges, self._with_roots(), self.case.unit)

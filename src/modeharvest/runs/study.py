@@ -17,7 +17,8 @@ import pandas as pd
 from pydantic import model_validator
 
 from modeharvest.fem.field import Solution
-from modeharvest.report.model import Findings, study_report, write_page, write_tables
+from modeharvest.report.model.content import Findings, study_report
+from modeharvest.report.model.output import write_page, write_tables
 from modeharvest.report.studies.modes import report_modes
 from modeharvest.report.studies.noise import report_noise
 from modeharvest.report.studies.resolution import report_resolution

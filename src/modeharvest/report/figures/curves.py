@@ -19,7 +19,7 @@ from modeharvest.idic.uncertainty.identifiability import OBSERVABLE
 from modeharvest.report.figures import style
 from modeharvest.report.figures.maps import WIDTH, ColourScale, colour_bar
 from modeharvest.report.figures.style import BLUE, GOLD, GREEN, INK, MUTED, RED
-from modeharvest.report.model import ten_to
+from modeharvest.report.model.text import ten_to
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.onset import Buckling, ImageAmplitude
 

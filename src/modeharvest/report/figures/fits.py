@@ -30,7 +30,8 @@ from modeharvest.report.figures.maps import (
     draw_field,
     draw_shape,
 )
-from modeharvest.report.model import Card, ReportFigure, Section, caption
+from modeharvest.report.model.content import Card, ReportFigure, Section
+from modeharvest.report.model.text import caption
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 FINE, SMOOTH, COARSE = 740, 360, 160

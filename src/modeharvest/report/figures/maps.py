@@ -23,7 +23,7 @@ from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.report.figures import style
 from modeharvest.report.figures.boundaries import MeshBoundary, block_means
-from modeharvest.report.model import ten_to
+from modeharvest.report.model.text import ten_to
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 DisplacementFunction = Callable[[FloatArray, FloatArray], FloatArray]
@@ -281,10 +281,10 @@ def bare_axes(
     return drawn, axes
 
 
-def draw_edge(axes: Axes, path: Path) -> PathPatch:
-    """Draw a boundary as a thin line."""
+def draw_edge(axes: Axes, path: Path, clip_on: bool = False) -> PathPatch:
+    """Draw a boundary as a thin line, also outside the axes unless it is clipped."""
     return style.draw_path(axes, path, fill=False, ec=style.EDGE, lw=0.5, rasterized=True,
-                           clip_on=False, zorder=1.5)  # fmt: skip
+                           clip_on=clip_on, zorder=1.5)  # fmt: skip
 
 
 def colour_bar(axes: Axes, scale: ColourScale) -> None:

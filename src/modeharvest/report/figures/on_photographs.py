@@ -19,7 +19,8 @@ from modeharvest.idic.photograph.finished import FinishedRun
 from modeharvest.idic.photograph.gauges import Gauge, GaugeReading, Readings
 from modeharvest.report.figures import maps, style
 from modeharvest.report.figures.boundaries import MeshBoundary
-from modeharvest.report.model import Card, ReportFigure, ReportTable, caption, number
+from modeharvest.report.model.content import Card, ReportFigure, ReportTable
+from modeharvest.report.model.text import caption, number
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import MissingDependencyError
 from modeharvest.util.files import atomic
@@ -43,7 +44,7 @@ def draw_on_photograph(
     if picture is not None:
         maps.show_grey(axes, frame, picture, None, grid)
     maps.shaded(axes, result.mesh, moved, values, scale)
-    edge = maps.draw_edge(axes, frame.boundary.path(moved))
+    edge = maps.draw_edge(axes, frame.boundary.path(moved), clip_on=True)
     if picture is not None:  # again, on top: sides of transparent triangles would be visible
         maps.show_grey(axes, frame, picture, None, grid)
         axes.images[-1].set(alpha=1.0 - _OPAQUE, clip_path=edge, zorder=1.4)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures.curves import curve
 from modeharvest.report.figures.style import BLUE, GREY, MUTED, RED, figure, style, to_svg
-from modeharvest.report.model import Card
+from modeharvest.report.model.content import Card
 from modeharvest.runs.photographs.watch import WatchedTest
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.files import atomic

@@ -14,7 +14,8 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.report.figures import fits
 from modeharvest.report.figures.fits import UM, Panel, S
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
-from modeharvest.report.model import Card, Cell, ReportTable, text_of
+from modeharvest.report.model.content import Card, ReportTable
+from modeharvest.report.model.text import Cell, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import headings
 from modeharvest.validation.truth import lengths

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from modeharvest.report.figures import style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, colour_bar, shaded
-from modeharvest.report.model import Findings, KeyNumber, ReportTable, text_of
+from modeharvest.report.model.content import Findings, KeyNumber, ReportTable
+from modeharvest.report.model.text import text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.modes import (
     IDEAL,

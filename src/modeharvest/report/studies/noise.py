@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import SMALL, WIDE, curve
 from modeharvest.report.figures.maps import ColourScale, colour_bar
-from modeharvest.report.model import Findings, KeyNumber, ReportTable, text_of
+from modeharvest.report.model.content import Findings, KeyNumber, ReportTable
+from modeharvest.report.model.text import text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.noise_statistics import (
     CAUSES,

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import curve, plain_ticks
-from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model.content import Findings, KeyNumber, ReportTable
+from modeharvest.report.model.text import number, text_of
 from modeharvest.validation.scoring.star import KEPT
 from modeharvest.validation.studies.buckled import ResolutionSpec
 from modeharvest.validation.studies.resolution import MOTIONS, ResolutionAnalysis

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import SMALL, curve
-from modeharvest.report.model import Findings, KeyNumber, ReportTable, text_of
+from modeharvest.report.model.content import Findings, KeyNumber, ReportTable
+from modeharvest.report.model.text import text_of
 from modeharvest.validation.studies.robustness import (
     OUTLIER_PERCENT,
     PUBLISHED,

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from modeharvest.report.figures import style
-from modeharvest.report.model import Findings, KeyNumber, ReportTable, number, text_of
+from modeharvest.report.model.content import Findings, KeyNumber, ReportTable
+from modeharvest.report.model.text import number, text_of
 from modeharvest.validation.studies.systematic import BASE, FACTORS, SystematicAnalysis
 
 ERROR_LABELS = {

@@ -102,7 +102,8 @@ def leaderboard(
     at least half of the material; codes with more such cases rank first. Returns the content of
     ``leaderboard.json``. InputError if nothing can be graded.
     """
-    from modeharvest.report.model import Card, Report, ReportTable, Section, write_page
+    from modeharvest.report.model.content import Card, Report, ReportTable, Section
+    from modeharvest.report.model.output import write_page
 
     handed_in, truth, out = Path(handed_in), Path(truth), Path(out)
     remedy = "'modeharvest benchmark standard' leaves it beside the public folder"

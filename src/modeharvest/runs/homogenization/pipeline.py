@@ -171,7 +171,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
 
         def work() -> tuple[Path, ...]:
             from modeharvest.report.homogenization import homogenization_report
-            from modeharvest.report.model import write_page
+            from modeharvest.report.model.output import write_page
 
             summary = summary_of(self.case.title, self.case.plain(), data)
             write_page(homogenization_report(summary, data), page, self.progress)

@@ -192,7 +192,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         statements = [*found.statements, *choices, *comparison, *(f.read_as for f in self._given)]
         summary |= to_plain({"laws": laws, "statements": statements, "warnings": warnings})
         from modeharvest.report.identification import identification_report
-        from modeharvest.report.model import write_page
+        from modeharvest.report.model.output import write_page
 
         write_page(identification_report(summary, found, data), page, self.progress)
         write_json(path, summary)

@@ -150,7 +150,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
         def work() -> tuple[Path, ...]:
             from modeharvest.report.lattice import lattice_report
-            from modeharvest.report.model import write_page
+            from modeharvest.report.model.output import write_page
 
             run = self._run(done)
             fields = self._patterns if "families" in done else []

@@ -211,7 +211,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         """
         with exclusive(self.folder):
             require_writable(self.folder)
-            from modeharvest.report.model import write_page
+            from modeharvest.report.model.output import write_page
             from modeharvest.report.photographs import photographs_report
 
             harvest = replace(self.harvest(truth), gauges=self._gauges())

@@ -45,7 +45,7 @@ from modeharvest.imaging.photographs.photograph import (
     read_photograph,
     read_reference,
 )
-from modeharvest.report.model import text_of
+from modeharvest.report.model.text import text_of
 from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
 from modeharvest.runs.photographs.sequence import chosen_frames, named_files
 from modeharvest.util.arrays import BoolArray, FloatImage
