@@ -34,7 +34,7 @@ class CorrelationOptions:
     gradient: str | None = None
     """Gradient that weighs the residual in the end, see :mod:`modeharvest.idic.solver.weighting`:
     that of the "deformed" image at x + u (the least-squares minimum), or that of the "reference" at
-    x. By default "reference" where the residual is noise, else "deformed"."""
+    x. By default "reference" if the residual is noise or speckle is below 4 px, else "deformed"."""
     gradient_blur_px: float | None = None
     """Blur of the image before this gradient is taken, on the finest level [px]. By default none,
     or where the residual is noise, the blur that minimises the variance of the unknowns."""

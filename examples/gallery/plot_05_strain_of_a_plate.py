@@ -47,9 +47,9 @@ print({key: numbers[key] for key in ("rms_px", "median_sd_px", "coverage", "cuto
 
 mesh = meshio.read(folder / "out/results/deformed.vtu")
 E = np.asarray(mesh.point_data["green_lagrange"]).reshape(len(mesh.points), -1)[:, 0]
-corners = mesh.cells[0].data[:, :3]
+finer = mesh.cells[0].data[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]]  # of quadratic ones
 fig, ax = plt.subplots(figsize=(7, 4.6), layout="constrained")
-shown = ax.tripcolor(*mesh.points[:, :2].T, corners, 100 * E, shading="gouraud")
+shown = ax.tripcolor(*mesh.points[:, :2].T, finer.reshape(-1, 3), 100 * E, shading="gouraud")
 ax.set_aspect("equal")
 ax.set(xlabel="x [px]", ylabel="y [px]", title="Green–Lagrange strain along x")
 fig.colorbar(shown, label="%")

@@ -209,8 +209,7 @@ def read_field(
     displacement_units : Units of u and v, if they are not those of x and y.
     y_axis : "up" or "down": where y grows and v is positive; None: as the columns' names state. In
         pixels, "up" counts from the lowest row.
-    first_pixel : Coordinate of the first pixel's centre, 0 or (as in MATLAB) 1; None: 0, or as in
-        the convention of the code that is recognised.
+    first_pixel : Coordinate of the first pixel's centre, 0 (also if None) or, as in MATLAB, 1.
     columns : Names, or numbers from 1, of columns for "x", "y", "u", "v", "sd_u", "sd_v", "sigma"
         and "valid", where they aren't recognised by name.
     frame : Number from 1 of the field in a file that holds several, as Ncorr's.

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 
-_FINE_PX = 0.25
+_FINER = 0.25
 """Spacing of the trial points for the nearest point, relative to that of the contour's points."""
 
 
@@ -57,7 +57,7 @@ class Contour:
 
     def _dense_lengths(self) -> FloatArray:
         """(k,) arc lengths [mm] of the trial points for the nearest point of the curve."""
-        step = _FINE_PX * self.length / len(self.points)
+        step = _FINER * self.length / len(self.points)
         count = int(self.length / step)
         return np.linspace(0.0, self.length, count, endpoint=not self.closed, dtype=np.float64)
 
