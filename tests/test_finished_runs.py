@@ -126,7 +126,7 @@ def test_a_field_is_animated_on_the_photographs(run: Path, monkeypatch: pytest.M
 
 def test_a_specimen_that_leaves_the_picture_is_cut_at_its_border() -> None:
     """Its edge, too, would be drawn over the colour bar."""
-    away = result(affine(STRETCH) + [4.0, 0.0])  # the picture is 12 mm wide
+    away = result(affine(STRETCH) + np.array([4.0, 0.0]))  # the picture is 12 mm wide
     scale = ColourScale(SIZE, 0.0, 1.0, "mm")
     drawn = draw_on_photograph(away, np.zeros(len(MESH.nodes)), scale, None)
     (axes,) = drawn.axes

@@ -1,0 +1,1 @@
+"""Reports as data: text and content; output as HTML, as CSV and on the terminal."""
