@@ -257,7 +257,7 @@ class Specimen:
         """The rectangular lattice's buckling pattern at ``points`` (n, 2), amplitude 1 [-].
 
         u_x = -cos(pi x/l) sin(pi y/l), u_y = sin(pi x/l) cos(pi y/l) with the origin at a
-        solid junction between four holes (Eq. (mode) of the paper). Holes become ellipses,
+        solid junction between four holes (Eq. (6) of the paper). Holes become ellipses,
         neighbours rotate in opposite senses. Along y, l is the distance of the rows.
         """
         a, b = self.cellular_half_size

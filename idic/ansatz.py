@@ -2,7 +2,7 @@
 
 Optionally also a gain and an offset between the images' grey levels.
 
-Source: the paper's Eq. (u_dic). Everything is in mm in the physical frame (x right, y up).
+Source: the paper's Eq. (4). Everything is in mm in the physical frame (x right, y up).
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def correlate(
     """Find the unknowns that make the deformed image match the reference.
 
     Minimises 1/2 sum (f(x) - g(x + u(x, a)))^2 over the pixels of the reference that show material:
-    the paper's Eqs. (r), (dof_opt) and (u_dic).
+    the paper's Eqs. (2), (3) and (4).
 
     Raises InputError if both strain and guess are given, or the guess doesn't fit the ansatz.
 

@@ -3,7 +3,7 @@
 A mode is phi(x) = s tau(x) sum_w (A_w, B_w) sin(pi/l (kx_w x + ky_w y + c_w)): k is
 dimensionless (1 is a wavelength of 2 l), c is in mm, s is a fixed scale and tau the support.
 A family maps the few parameters a of the mode to the five parameters of each wave, P = C a + P0;
-the paper's Eq. (mode) is one of them.
+the paper's Eq. (6) is one of them.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class ModeFamily:
 
 
 def square_family(origin: str = "junction") -> ModeFamily:
-    """Make the paper's Eq. (mode): two waves along the diagonals, seven parameters.
+    """Make the paper's Eq. (6): two waves along the diagonals, seven parameters.
 
     phi_x = a1 [-sin t1 - sin t2], phi_y = sin t1 - sin t2 with t1 = pi/l (a2 x + a3 y + a6) and t2
     = pi/l (a4 x + a5 y + a7); a6 and a7 are in mm. The origin is a "junction", the solid between
@@ -161,7 +161,7 @@ def rotation_family(specimen: Specimen) -> ModeFamily:
 
 
 def turning_family(vectors: FloatArray, cell_size: float, junction: ArrayLike) -> ModeFamily:
-    """Make Eq. (mode) for a rectangular lattice, rows of ``vectors`` (2, 2), about a junction [mm].
+    """Make Eq. (6) for a rectangular lattice, rows of ``vectors`` (2, 2), about a junction [mm].
 
     The initial wave vectors are those of the lattice, in units of pi over the cell size [mm]; a1
     starts as the ratio of amplitudes with which junctions rotate without changing shape.

@@ -69,7 +69,7 @@ class PhotographOptions(AnsatzOptions):
     """Table ``[correlation]`` of an experiment with photographs."""
 
     family: str = "auto"
-    """Mode family: "auto" reads the modes off the spectrum; "square" is the paper's Eq. (mode)."""
+    """Mode family: "auto" reads the modes off the spectrum; "square" is the paper's Eq. (6)."""
     fixed_mode: bool | str = "auto"
     """Keep phi1 as initially found; "auto" does so where no pattern is observable."""
     edge_px: int = 3

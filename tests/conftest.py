@@ -5,10 +5,9 @@ from __future__ import annotations
 import gc
 import importlib.util
 import os
-import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,15 +15,16 @@ import matplotlib
 import psutil
 import pytest
 from hypothesis import HealthCheck, settings
-from hypothesis.internal import scrutineer
 
 matplotlib.use("Agg")
 
-# Where Debian installs packages they are no code of this project's, either. hypothesis would read
-# a thousand files for numbers to try: seconds of each process, and elsewhere other examples.
-getattr(scrutineer, "SITE_PACKAGES_DIRS", set()).update(
-    Path(folder).resolve() for folder in sys.path if folder.endswith("-packages")
-)
+with suppress(ImportError):  # versions of hypothesis that know nothing of it
+    from hypothesis.internal.conjecture import providers
+    from hypothesis.internal.constants_ast import Constants
+
+    # It would try numbers from the source of all modules that a process has imported: examples
+    # would depend on the tests that the process ran before.
+    providers._get_local_constants = Constants
 
 settings.register_profile(
     "modeharvest",

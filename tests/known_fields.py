@@ -1,4 +1,4 @@
-"""Displacement fields that are known: Eq. (mode) of the paper, fields taken at some pixels."""
+"""Displacement fields that are known: Eq. (6) of the paper, fields taken at some pixels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def sampled_field(
 
 
 def square_mode(mode: object, pitch: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(..., 2) Eq. (mode), unscaled and without taper, of a₁ … a₅ [-], a₆ and a₇ [mm]."""
+    """(..., 2) Eq. (6), unscaled and without taper, of a₁ … a₅ [-], a₆ and a₇ [mm]."""
     a = np.asarray(mode, dtype=np.float64)
     first = np.sin(np.pi / pitch * (a[1] * x + a[2] * y + a[5]))
     second = np.sin(np.pi / pitch * (a[3] * x + a[4] * y + a[6]))

@@ -1,7 +1,7 @@
 """Mode families found automatically in fields that were made up, on meshes with holes.
 
 Guards: waves, amplitudes and phases come back as they went in, at the rate of the mesh; the square
-pattern becomes the paper's Eq. (mode) wherever the origin is; what is equal is tied and what is not
+pattern becomes the paper's Eq. (6) wherever the origin is; what is equal is tied and what is not
 stays free; energies are right; the family is the field when the rest of idic evaluates it.
 """
 
@@ -61,7 +61,7 @@ def assert_is_field(found: FoundFamily, mesh: Mesh, u: np.ndarray) -> None:
 
 @pytest.mark.parametrize(("origin", "shift"), [("hole", 0.0), ("junction", PITCH / 2)])
 def test_square_pattern_is_the_papers_mode(origin: str, shift: float) -> None:
-    """Matrix and offset are those of Eq. (mode), and the start is the paper's (facts: IDIC)."""
+    """Matrix and offset are those of Eq. (6), and the start is the paper's (facts: IDIC)."""
     paper = square_family(origin)
     mesh = moved(SQUARE_MESH, (shift, shift))
     u = -0.3 * square_mode(paper.start, PITCH, *mesh.nodes.T)
@@ -72,7 +72,7 @@ def test_square_pattern_is_the_papers_mode(origin: str, shift: float) -> None:
     np.testing.assert_allclose(found.family.start, paper.start, atol=INTERPOLATION)
     assert found.amplitude == pytest.approx(-0.3, rel=INTERPOLATION)
     assert_is_field(found, mesh, u)
-    assert f"Eq. (mode) of the paper ({paper.name})" in found.text[-1]
+    assert f"Eq. (6) of the paper ({paper.name})" in found.text[-1]
 
 
 @SETTINGS

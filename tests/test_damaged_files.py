@@ -9,12 +9,12 @@ from __future__ import annotations
 import faulthandler
 import json
 import re
-import shutil
 import subprocess
 import sys
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -333,23 +333,31 @@ def variants(name: str, whole: Path) -> Iterator[bytes]:
 
 def _other_types(random: np.random.Generator, whole: Path) -> bytes:
     """HDF5 only: an object or attribute left out, or another in its place."""
-    copy = whole.with_name(f"other{whole.suffix}")
-    shutil.copyfile(whole, copy)
-    with h5py.File(copy, "r+") as file:
-        places: list[tuple[Any, str]] = [(file.attrs, name) for name in file.attrs]
-
-        def look_at(name: str, thing: Any) -> None:
-            above, _, last = name.rpartition("/")
-            places.append((file[above or "/"], last))
-            places.extend((thing.attrs, attribute) for attribute in thing.attrs)
-
-        file.visititems(look_at)
-        where, name = places[random.integers(len(places))]
+    places = _places(whole)
+    above, name, is_attribute = places[random.integers(len(places))]
+    with h5py.File(whole, "r+", driver="core", backing_store=False) as file:  # a copy in memory
+        where = file[above].attrs if is_attribute else file[above]
         new = _OTHERS[random.integers(len(_OTHERS))]
         del where[name]
         if new is not None:
             where[name] = new
-    return copy.read_bytes()
+        file.flush()
+        return bytes(file.id.get_file_image())
+
+
+@cache
+def _places(whole: Path) -> list[tuple[str, str, bool]]:
+    """Of an HDF5 file: what each object and attribute is in, its name, and whether it is one."""
+    with h5py.File(whole, "r") as file:
+        places = [("/", name, True) for name in file.attrs]
+
+        def look_at(name: str, thing: Any) -> None:
+            above, _, last = name.rpartition("/")
+            places.append((above or "/", last, False))
+            places.extend((name, attribute, True) for attribute in thing.attrs)
+
+        file.visititems(look_at)
+    return places
 
 
 _OTHERS: tuple[Any, ...] = (
@@ -385,7 +393,11 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_damaged_file_reads_or_is_refused_in_a_line(
-    readables: dict[str, Readable], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    readables: dict[str, Readable],
+    reader: subprocess.Popen[str],
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     readable = readables[name]
     assert _outcome(readable.read, readable.path) == ""
@@ -397,7 +409,7 @@ def test_a_damaged_file_reads_or_is_refused_in_a_line(
         files = [tmp_path / f"{k:03d}{readable.path.suffix}" for k in range(VARIANTS)]
         for path, content in zip(files, damaged, strict=True):
             path.write_bytes(content)
-        _read_at_once(monkeypatch, readable.child, files)
+        _read_at_once(monkeypatch, reader, readable.child, files)
     refused, begin = 0, _peak_bytes(reset=True)
     for k, path in enumerate(files):
         if k % 50 == 0:  # a limit for so many together: setting one takes longer than many a read
@@ -416,29 +428,56 @@ def _one_after_the_other(path: Path, contents: Iterable[bytes]) -> Iterator[Path
         yield path
 
 
-def _read_at_once(monkeypatch: pytest.MonkeyPatch, kind: str, files: list[Path]) -> None:
-    """Let one child read all the variants, a second one what it leaves if it crashes, and so on."""
-    script = (
-        "import sys\n"
-        "from modeharvest.util import child\n"
-        "kind, *paths = sys.argv[1:]\n"
-        "child.limit_memory(paths[0])\n"
-        "for path in paths:\n"
-        "    print(path, end='\\t', flush=True)\n"
-        "    print(child.convert(kind, path, path + '.npz'), flush=True)\n"
-    )
+_READER = """
+import json, mmap, os, signal, sys
+import meshio, scipy.io
+from modeharvest.util import child
+begun = mmap.mmap(-1, 8)  # how many files, counted by forks
+for line in sys.stdin:
+    limit, kind, *paths = json.loads(line)
+    first = 0
+    while first < len(paths):
+        if os.fork() == 0:
+            signal.alarm(limit)
+            child.limit_memory(paths[first])
+            for k in range(first, len(paths)):
+                begun[:] = (k + 1).to_bytes(8)
+                message = child.convert(kind, paths[k], paths[k] + ".npz")
+                print(json.dumps([paths[k], message]), flush=True)
+            os._exit(0)
+        end, last = os.waitstatus_to_exitcode(os.wait()[1]), int.from_bytes(begun[:])
+        if end == -signal.SIGALRM or last <= first:
+            sys.exit(f"no end, or no beginning: {paths[last - 1]}")
+        first = last
+    begun[:] = bytes(8)
+    print("null", flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def reader() -> Iterator[subprocess.Popen[str]]:
+    """A process that has imported the parsers, for forks of it to read files."""
+    command, pipe = [sys.executable, "-c", _READER], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        yield process
+        process.communicate(timeout=LONGEST_S)
+
+
+def _read_at_once(
+    monkeypatch: pytest.MonkeyPatch, reader: subprocess.Popen[str], kind: str, files: list[Path]
+) -> None:
+    """Let one fork read all the variants, a second one what it leaves if it crashes, and so on."""
+    assert reader.stdin is not None
+    assert reader.stdout is not None
+    print(json.dumps([int(LONGEST_S), kind, *map(str, files)]), file=reader.stdin, flush=True)
     message: dict[str, str] = {}
-    while len(message) < len(files):
-        command = [sys.executable, "-c", script, kind, *map(str, files[len(message) :])]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S)
-        lines = done.stdout.splitlines()
-        message |= {p: words for p, _, words in (line.partition("\t") for line in lines)}
-        assert lines
+    while found := json.loads(reader.stdout.readline()):
+        message |= [found]
 
     def read(kind: str, path: Path, what: str, remedy: str) -> dict[str, Any]:
         with reading(path, what, remedy):
-            if message[str(path)] or not (found := Path(f"{path}.npz")).is_file():
-                raise ValueError(message[str(path)] or "a file that makes its parser crash")
+            if message.get(str(path)) or not (found := Path(f"{path}.npz")).is_file():
+                raise ValueError(message.get(str(path)) or "a file that makes its parser crash")
             with np.load(found) as file:
                 return {str(n): file[f"arr_{k}"] for k, n in enumerate(file["names"])}
 

@@ -1,4 +1,4 @@
-"""Mode families of real lattice modes: the square lattice's is Eq. (mode), the flower is six waves.
+"""Mode families of real lattice modes: the square lattice's is Eq. (6), the flower is six waves.
 
 Guards: the paper's reading of Fig. 2 for the square stacking under every loading, at every
 origin and on meshes without symmetry; what is found on the post-buckled branch; the symmetries of

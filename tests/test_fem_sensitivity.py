@@ -309,7 +309,7 @@ def test_parameters_are_identified_from_a_state_beside_the_bifurcation(
         "amplitude[1]": Unknown(0.05, (-1.0, 1.0)),
     }
     readings = Readings(np.array(strains), 1e-5)
-    found = identify(test.at, data, unknowns, pixel_size=0.03, strains=readings)
+    found = identify(test.near, data, unknowns, pixel_size=0.03, strains=readings)
     exact = np.array([3.0, 5.4, true[1].amplitude])
     assert np.all(np.abs(found.values - exact) < 4.0 * found.sd)
     assert found.sd[1] < 0.1

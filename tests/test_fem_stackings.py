@@ -61,7 +61,7 @@ def summary_of(
 def test_ellipses_in_rectangular_stacking_buckle_and_are_measured(tmp_path: Path) -> None:
     summary = summary_of(RECTANGULAR, 0.13, tmp_path, 3)
     (snapshot,) = summary["snapshots"]
-    # Rows turn in opposite senses, weaker at the edges: Eq. (mode) with an envelope.
+    # Rows turn in opposite senses, weaker at the edges: Eq. (6) with an envelope.
     assert summary["critical"]["pattern_overlap_by_cell"] > 0.85
     assert (snapshot["branch"], snapshot["negative_pivots"]) == ("buckled+", 0)
     assert snapshot["outcome"] == "converged"

@@ -1,4 +1,4 @@
-"""Modes: the paper's Eq. (mode), its two equivalent starts, scale, support and derivatives."""
+"""Modes: the paper's Eq. (6), its two equivalent starts, scale, support and derivatives."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.report.figures import style
 from modeharvest.runs.case import shipped_solution
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
@@ -67,7 +68,9 @@ def photographs(images: ImageSet, tmp_path_factory: pytest.TempPathFactory) -> P
 def harvested(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished harvest."""
     out = tmp_path_factory.mktemp("harvest")
-    harvest(photographs / "experiment.toml", out)
+    with pytest.MonkeyPatch.context() as patch:  # no test here is about pictures
+        patch.setattr(style, "to_svg", lambda *_, **__: "<svg></svg>")
+        harvest(photographs / "experiment.toml", out)
     return out
 
 

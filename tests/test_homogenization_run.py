@@ -316,7 +316,7 @@ def test_computed_modes_are_alternatives(tmp_path: Path) -> None:
         out = tmp_path / kind
         found.append(HomogenizationRun(HomogenizationCase.read(case), out).homogenize())
     analytic, bloch = (content["response"]["critical_strain"] for content in found)
-    # The lattice's own mode has what Eq. (mode) leaves to w, which plates then hold less.
+    # The lattice's own mode has what Eq. (6) leaves to w, which plates then hold less.
     assert 0.85 * analytic < bloch < analytic
     assert found[0]["effects"] == [] == found[1]["effects"]
     for kind, has_waves in (("analytic", True), ("bloch", False)):

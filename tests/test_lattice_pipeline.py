@@ -140,7 +140,7 @@ def test_beyond_the_branch_costs_less_energy_and_is_stable(finished: Path) -> No
 
 
 def test_the_square_lattice_s_family_is_the_paper_s(finished: Path) -> None:
-    """Eq. (mode): two waves along the diagonals, seven parameters."""
+    """Eq. (6): two waves along the diagonals, seven parameters."""
     families = {f["of"]: f for f in read_json(finished / "summary.json")["families"]}
     mode = families["mode φ₁"]
     assert mode["parameters"] == 7

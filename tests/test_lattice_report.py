@@ -91,8 +91,8 @@ def test_everything_of_a_full_run_is_there(text: str) -> None:
 
 
 def test_the_paper_s_family_is_recognised_and_its_waves_are_written(text: str) -> None:
-    # The made-up pattern is Eq. (mode) itself: two waves along the diagonals, seven parameters.
-    assert "This is Eq. (mode) of the paper (square, origin at a hole): seven parameters" in text
+    # The made-up pattern is Eq. (6) itself: two waves along the diagonals, seven parameters.
+    assert "This is Eq. (6) of the paper (square, origin at a hole): seven parameters" in text
 
 
 def test_what_a_run_does_not_have_is_left_out(tmp_path: Path) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import h5py
 import meshio
@@ -217,22 +219,32 @@ def test_other_files_say_the_same(result: NodalResult, measured: Path, tmp_path:
     assert np.isnan(table[1, 4:]).all()  # in the hole
 
 
+@pytest.fixture(scope="module")
+def no_numbers(
+    plate: Plate, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[dict[str, Any], Path]:
+    """Of a folder with an empty file, without a mask and a pixel size: summary and output."""
+    shots, out = tmp_path_factory.mktemp("shots"), tmp_path_factory.mktemp("no_numbers")
+    (shots / "a.tif").write_bytes((plate.folder / "a.tif").read_bytes())
+    (shots / "b.tif").touch()
+    return measure(plate.folder / "ref.tif", [shots], out), out
+
+
 def test_an_empty_file_in_a_folder_is_skipped_and_the_rest_goes_on(
-    plate: Plate, tmp_path: Path
+    no_numbers: tuple[dict[str, Any], Path],
 ) -> None:
-    (tmp_path / "shots").mkdir()
-    (tmp_path / "shots/a.tif").write_bytes((plate.folder / "a.tif").read_bytes())
-    (tmp_path / "shots/b.tif").touch()
-    summary = measure(plate.folder / "ref.tif", [tmp_path / "shots"], tmp_path / "out")
+    summary, _ = no_numbers
     (image,), (skipped,) = summary["images"], summary["skipped"]
     assert (image["name"], skipped["name"]) == ("a", "b")
     assert "an empty file, cut short at 0 bytes" in skipped["reason"]
 
 
-def test_material_is_found_and_lengths_are_pixels(plate: Plate, tmp_path: Path) -> None:
-    summary = measure(plate.folder / "ref.tif", [plate.folder / "a.tif"], tmp_path)
+def test_material_is_found_and_lengths_are_pixels(
+    plate: Plate, no_numbers: tuple[dict[str, Any], Path]
+) -> None:
+    summary, out = no_numbers
     (image,) = summary["images"]
-    u = read_result(tmp_path / "results/a.h5").displacement_on()
+    u = read_result(out / "results/a.h5").displacement_on()
     error = u - plate.truth["a"] / GRID.pixel_size
     both = plate.mask & np.isfinite(error).all(axis=-1)
     assert both.sum() > 0.9 * plate.mask.sum()
@@ -326,6 +338,19 @@ def test_start_follows_what_no_polynomial_does() -> None:
     assert np.quantile(off[inner], 0.99) < 4.0
 
 
+@cache
+def body_of_all(grid: PixelGrid) -> Body:
+    """A mesh of all pixels."""
+    return FiniteElementOptions().body(np.ones(grid.shape, bool), grid)
+
+
+@cache
+def plate_and_body() -> tuple[ImagePair, Body]:
+    """The plate under a quadratic field, and its mesh."""
+    exact = plate_pair(quadratic_field, 0.004)
+    return exact, FiniteElementOptions().body(exact.masks[0], GRID)
+
+
 @pytest.mark.parametrize(("size_px", "amplitude_px"), [(5.0, 0.0), (12.0, 0.0), (5.0, 0.2)])
 def test_error_bars_of_a_smooth_displacement_count_the_start_s_noise(
     size_px: float, amplitude_px: float
@@ -349,7 +374,7 @@ def test_error_bars_of_a_smooth_displacement_count_the_start_s_noise(
         pattern(*grid.to_px(x[..., 0], x[..., 1])) + 0.01 * rng.standard_normal(shape)
         for x in (at, inverted(u, at, 1e-9))
     ]
-    pair, body = ImagePair(*images, grid), FiniteElementOptions().body(np.ones(shape, bool), grid)
+    pair, body = ImagePair(*images, grid), body_of_all(grid)
     nodes = body.mesh.nodes
     found = displacement_from(block_motion(pair, body, 0.0 * nodes), pair, body)
     seen = (np.abs(nodes + u(nodes)) < [grid.x[-3], grid.y[2]]).all(axis=1)
@@ -365,10 +390,9 @@ def error_from(
 
     The start is off by a wave; the light grows along x in the deformed image by a share.
     """
-    exact = plate_pair(quadratic_field, 0.004)
+    exact, body = plate_and_body()
     mask, slope = exact.masks[0], 1.0 + light * GRID.x / GRID.x.max()
     pair = ImagePair(255 * exact.reference, 255 * slope * exact.deformed, GRID, mask)
-    body = FiniteElementOptions().body(mask, GRID)
     phase = 2.0 * np.pi / (wave_px * GRID.pixel_size) * body.mesh.nodes[:, ::-1]
     wave = off_px * GRID.pixel_size * np.column_stack([np.cos(phase[:, 0]), np.sin(phase[:, 1])])
     start = quadratic_field(body.mesh.nodes) + wave

@@ -56,7 +56,7 @@ def rectangle(half: tuple[float, float], count: tuple[int, int]) -> Mesh:
 
 
 def mode_of(pitch: float, aspect: float = 1.0) -> PatternMode:
-    """Eq. (mode) itself with a1 = ``aspect``, posing as a numerical mode."""
+    """Eq. (6) itself with a1 = ``aspect``, posing as a numerical mode."""
     mesh = rectangle((0.5 * pitch, 0.5 * pitch), (8, 8))
     ideal = wave_sum(EQ_MODE.waves(EQ_MODE.start), mesh.nodes, pitch)
     row = ModeRow("", "uniaxial", pitch, 0.79, 8, True, 0.074, "pattern", 0.074, 0.074, 0.0, 1.0,
@@ -92,7 +92,7 @@ def test_the_pattern_s_amplitude_is_seen_through_everything_else() -> None:
 
 
 def test_the_lattice_s_mode_lies_on_the_specimen_s_holes() -> None:
-    """Eq. (mode) about a hole, copied to all of them, is Eq. (mode) about a junction."""
+    """Eq. (6) about a hole, copied to all of them, is Eq. (6) about a junction."""
     mode, family = mode_of(1.9), square_family("junction")
     assert overlap_on_specimen(mode, SOLID, family, family.start) == pytest.approx(1.0, abs=1e-4)
     tilted = family.start.copy()

@@ -26,6 +26,7 @@ from modeharvest.idic.finite_element.contours.measure import (
 from modeharvest.idic.finite_element.contours.penalised_body import straight_sides
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.plain.matching import matched_contours
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain
 from modeharvest.idic.photograph.plain.surface import away_from_cuts, plain_surface
@@ -37,6 +38,7 @@ from modeharvest.imaging.photographs.files import read_image, read_mask, write_i
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.report.figures import style
 from modeharvest.runs.measure import measure
 from modeharvest.runs.photographs.pipeline import harvest
 from modeharvest.util.arrays import FloatArray, FloatImage
@@ -47,8 +49,9 @@ from modeharvest.validation.whole_field import v_percent, waves_percent
 pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
 
 SHIPPED = Path(__file__).parents[1] / "src/modeharvest/cases/paper-virtual.h5"
+PIXEL = 0.05
 PLAIN = ImagingSpec(
-    pixel_size=0.04,
+    pixel_size=PIXEL,
     margin_px=12,
     background=0.15,
     speckle=SpeckleSpec(dark=0.7, bright=0.7),
@@ -231,20 +234,29 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_buckled_specimen_without_speckle(photographed: Path) -> None:
-    solution = Solution.read(SHIPPED)
-    images = make_images(solution, PLAIN, photographed, (0.128,))
-    (pair,) = images
+@pytest.fixture(scope="module")
+def measured(
+    photographed: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[dict[str, Any], Path]:
+    """What ``measure`` returns for the whole specimen, and its output folder."""
+    out = tmp_path_factory.mktemp("measured")
+    names = [photographed / f"{name}_8bit.tif" for name in ("reference", "deformed_1280")]
+    with pytest.MonkeyPatch.context() as patch:  # no test here is about pictures
+        patch.setattr(style, "to_svg", lambda *_, **__: "<svg></svg>")
+        return measure(names[0], names[1:], out, pixel_size=PIXEL), out
+
+
+def test_a_buckled_specimen_without_speckle(
+    photographed: Path, measured: tuple[dict[str, Any], Path]
+) -> None:
+    (pair,) = make_images(Solution.read(SHIPPED), PLAIN, photographed, (0.128,))
     px, u = pair.grid.pixel_size, pair.truth.displacement
     f, g = (
         read_image(photographed / f"{name}_8bit.tif") for name in ("reference", "deformed_1280")
     )
     surface = plain_surface(f)
     assert surface is not None
-    body = FiniteElementOptions().body(surface.mask, pair.grid)
-    result, matched = displacement_of_plain(surface, g, pair.grid, body)
-    assert matched.lost == 0
-    assert len(matched.holes) == 60
+    result = read_result(measured[1] / "results/deformed_1280_8bit.h5")
     found = result.displacement_on()
     there = np.isfinite(u[..., 0]) & surface.mask & np.isfinite(found[..., 0])
     off = (found - u)[there] / px
@@ -254,8 +266,11 @@ def test_a_buckled_specimen_without_speckle(photographed: Path) -> None:
     assert 0.9 < np.mean(np.abs(off) < 1.96 * sd) <= 1.0
     assert result.shown == "contours"
     # It doesn't matter where the iteration begins: from a picture before, turned a little.
-    turned = result.displacement + 0.03 * body.mesh.nodes[:, ::-1] * [-1.0, 1.0]
-    again, _ = displacement_of_plain(surface, g, pair.grid, body, before=turned)
+    turned = result.displacement + 0.03 * result.mesh.nodes[:, ::-1] * [-1.0, 1.0]
+    body = Body(result.mesh)
+    again, matched = displacement_of_plain(surface, g, pair.grid, body, before=turned)
+    assert matched.lost == 0
+    assert len(matched.holes) == 60
     assert np.abs(again.displacement - result.displacement).max() < 0.02 * px
     # Holes are flattened along x and y in turn, as the pattern has it.
     flat = [abs(HoleShape.of(hole).orientation_deg) for _, hole in matched.holes]
@@ -353,19 +368,18 @@ def test_a_part_of_a_specimen_is_measured_away_from_where_it_is_cut(
 
 
 def test_measure_finds_by_itself_that_there_is_no_speckle(
-    photographed: Path, tmp_path: Path
+    measured: tuple[dict[str, Any], Path],
 ) -> None:
-    names = [photographed / f"{name}_8bit.tif" for name in ("reference", "deformed_1280")]
-    summary = measure(names[0], names[1:], tmp_path, pixel_size=0.04)
+    summary, out = measured
     (image,) = summary["images"]
     assert summary["mask"] == "found by its grey level"
     assert image["shown"] == "contours"
     assert image["coverage"] > 0.99
-    holes = (tmp_path / "results/deformed_1280_8bit_holes.csv").read_text().splitlines()
+    holes = (out / "results/deformed_1280_8bit_holes.csv").read_text().splitlines()
     assert len(holes) == 61
     assert holes[0].startswith("reference x [mm],reference y up [mm],")
-    assert read_json(tmp_path / "summary.json")["images"] == [image]
-    assert "held to the contours" in (tmp_path / "report.html").read_text()
+    assert read_json(out / "summary.json")["images"] == [image]
+    assert "held to the contours" in (out / "report.html").read_text()
 
 
 def test_dots_belong_to_the_material_and_are_followed(photographed: Path, tmp_path: Path) -> None:
@@ -373,11 +387,11 @@ def test_dots_belong_to_the_material_and_are_followed(photographed: Path, tmp_pa
     names = ["reference", "deformed_1280"]
     pictures = [read_image(photographed / f"{name}_8bit.tif") for name in names]
     grey = float(pictures[0][:3].mean())
-    for name, picture, edges in zip(names, pictures, dots(pair, 0.44), strict=True):
+    for name, picture, edges in zip(names, pictures, dots(pair, 11.0 * PIXEL), strict=True):
         shown = painted(picture, edges, grey)
         write_image(tmp_path / f"{name}.tif", np.rint(255.0 * shown).astype(np.uint8))
     found = measure(tmp_path / "reference.tif", [tmp_path / "deformed_1280.tif"], tmp_path / "out",
-                    pixel_size=0.04)  # fmt: skip
+                    pixel_size=PIXEL)  # fmt: skip
     assert any(text.startswith("45 dots are on the material") for text in found["warnings"])
     results = tmp_path / "out/results"
     assert len((results / "deformed_1280_holes.csv").read_text().splitlines()) == 1 + 60
@@ -442,7 +456,7 @@ def experiment(photographed: Path, tmp_path: Path) -> Path:
     path = tmp_path / "test.toml"
     path.write_text(
         f'[images]\nreference = "{names[0]}"\ndeformed = ["{names[1]}", "painted.tif"]\n'
-        "[scale]\npixel_size = 0.04\n[specimen]\ncell_size = 1.9\n"
+        f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = 1.9\n"
     )
     return path
 
@@ -487,7 +501,7 @@ def test_modes_of_a_part_in_view(photographed: Path, tmp_path: Path) -> None:
     path = tmp_path / "part.toml"
     path.write_text(
         '[images]\nreference = "f.tif"\ndeformed = ["g.tif"]\n'
-        "[scale]\npixel_size = 0.04\n[specimen]\ncell_size = 1.9\n"
+        f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = 1.9\n"
     )
     summary = harvest(path, tmp_path / "out")
     assert faults(summary, "harvest") == []

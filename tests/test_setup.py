@@ -24,7 +24,7 @@ def test_the_start_is_the_specimens_own_pattern(holes_x: int, holes_y: int) -> N
     a, b = specimen.cellular_half_size
     x, y = np.linspace(-a, a, 23), np.linspace(-b, b, 31)
     phi = ansatz.phi(0, start, x, y).reshape(-1, 2)
-    # Eq. (mode) is 2 cos sin at its largest where the pattern is cos sin: 0.04 times it.
+    # Eq. (6) is 2 cos sin at its largest where the pattern is cos sin: 0.04 times it.
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     pattern = 0.04 * specimen.pattern(points)
     sign = np.sign(np.sum(phi * pattern))

@@ -34,7 +34,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.validation.whole_field import v_percent, waves_percent
 
 pytest.importorskip("gmsh")
-pytestmark = pytest.mark.usefixtures("coarse_pictures")
+pytestmark = pytest.mark.usefixtures("coarse_pictures", "unrendered_pictures")
 
 SHIPPED = Path(__file__).parents[1] / "src/modeharvest/cases/paper-virtual.h5"
 PITCH, PIXEL, FINER, DIAMETER = 1.9, 0.035, 0.025, 1.4

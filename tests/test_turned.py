@@ -81,6 +81,7 @@ def test_a_harvest_turns_the_specimen_back(run: HarvestRun, name: str) -> None:
     assert strain.has_pattern
 
 
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_measure_follows_it_and_skips_what_is_no_photograph_of_it(
     photographs: Path, tmp_path: Path
 ) -> None:

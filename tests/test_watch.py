@@ -104,6 +104,15 @@ def test_what_does_not_grow_predicts_nothing() -> None:
     assert predicted(load[:4], grown(load[:4]), np.ones(4)) is None
 
 
+def test_a_photograph_that_determines_no_amplitude_does_not_count() -> None:
+    load, sd = np.linspace(0.005, 0.06, 12), np.full(12, 1e-6)
+    sd[[3, 11]] = np.inf
+    found = predicted(load, grown(load), sd)
+    assert found == predicted(*(part[np.isfinite(sd)] for part in (load, grown(load), sd)))
+    assert found is not None
+    assert found.count == 10
+
+
 def test_a_prediction_stays_once_buckling_is_near() -> None:
     load = np.linspace(0.005, 0.13, 26)
     amplitude = np.where(load < 0.097, grown(np.minimum(load, 0.097)), 200.0)

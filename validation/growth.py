@@ -89,10 +89,10 @@ def predict(columns: FloatArray) -> Prediction | None:
     """Extrapolate the growth of a pattern's amplitude to the critical load.
 
     ``columns`` (4, n): load, amplitude, its standard deviation by noise (increased to the observed
-    scatter if that is larger) and by model error, which grows with the load. Loads must be below
-    the critical one. None with fewer than five images, or if the amplitude doesn't grow.
+    scatter if that is larger) and by model error, which grows with the load; loads are below the
+    critical one. None with fewer than five finite columns, or if the amplitude doesn't grow.
     """
-    load, amplitude, sd, model = columns[:, columns[0] > 0.0]
+    load, amplitude, sd, model = columns[:, (columns[0] > 0.0) & np.isfinite(columns).all(axis=0)]
     if len(load) < FEWEST or not (sd > 0.0).all():
         return None
     last, most = int(np.argmax(load)), float(load.max())

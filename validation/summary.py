@@ -124,7 +124,7 @@ class SnapshotSummary:
     outcome_why: str
     modes: tuple[ModeSummary, ...] = ()
     mode_deviation_percent: tuple[float, ...] = ()
-    """Deviation of a single mode, Eq. (mode), from the ideal one; empty with several modes."""
+    """Deviation of a single mode, Eq. (6), from the ideal one; empty with several modes."""
     mode_observable: bool
     worst_determined: tuple[str, ...]
     undetermined: tuple[str, ...]

@@ -15,6 +15,7 @@ import tomllib
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -147,14 +148,18 @@ def literal(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else f"{value}"
 
 
-def accepted(prototype: Any, name: str, hint: Any) -> str:
+@cache
+def accepted(cls: type[Any], name: str) -> str:
     """The values of a key that the checks accept, with the prototype's values of other keys."""
+    hint, made = get_type_hints(cls, include_extras=True)[name], prototype(cls)
+    if made is None:
+        return ""
     kinds = plain_type(hint)
     choices = [v for k in (hint, *get_args(hint)) if get_origin(k) is Literal for v in get_args(k)]
     if choices:
         return ", ".join(literal(v) for v in choices)
     if kinds == "text":
-        message = refusal(prototype, name, "?")
+        message = refusal(made, name, "?")
         listed = re.search(r"among \[([^\]]*)\]|known are: (.*)", message)
         if listed:
             return (listed[1] or listed[2]).replace("'", '"')
@@ -165,7 +170,7 @@ def accepted(prototype: Any, name: str, hint: Any) -> str:
     whole = "whole" in kinds
 
     def is_fine(value: float) -> bool:
-        return not refusal(prototype, name, int(value) if whole else value)
+        return not refusal(made, name, int(value) if whole else value)
 
     return interval(is_fine, whole)
 
@@ -251,7 +256,7 @@ def below(name: str, hint: Any, path: str) -> Iterator[tuple[str, type[Any], str
 
 def keys(cls: type[Any], path: str) -> Iterator[tuple[str, ...]]:
     """A row for each key: name, type, unit, default, range, meaning."""
-    about, hints, made = docstrings(cls), get_type_hints(cls, include_extras=True), prototype(cls)
+    about, hints = docstrings(cls), get_type_hints(cls, include_extras=True)
     for f in fields(cls):
         if not f.init or f.name.startswith("_"):
             continue
@@ -268,7 +273,7 @@ def keys(cls: type[Any], path: str) -> Iterator[tuple[str, ...]]:
         shown = "required" if needed else "" if default is None else f"``{literal(default)}``"
         text = about.get(f.name, "") or f.metadata.get("label", "")
         of = f.metadata.get("unit") or unit(f.name, text, kind)
-        span = "" if made is None else accepted(made, f.name, hint)
+        span = accepted(cls, f.name)
         yield f"``{f.name}``", kind, of, shown, escaped(span), text
 
 

@@ -19,7 +19,7 @@ from modeharvest.runs.case import shipped_solution
 
 folder = Path(tempfile.mkdtemp())
 solution = mh.Solution.read(shipped_solution("paper-virtual"))
-spec = mh.ImagingSpec(pixel_size=0.04)
+spec = mh.ImagingSpec(pixel_size=0.05)
 spec = replace(spec, sensor=replace(spec.sensor, read_noise=0.01))
 images = mh.make_images(solution, spec, folder / "images")
 for path in (folder / "images").glob("*_8bit.tif"):
@@ -34,7 +34,7 @@ experiment = """
 reference = "reference.tif"
 deformed = ["frame_*.tif"]
 [scale]
-pixel_size = 0.04              # mm/px
+pixel_size = 0.05              # mm/px
 [specimen]
 cell_size = 1.9                # mm
 """

@@ -296,7 +296,7 @@ def chosen_modes(
     if wants_square or (ansatz.fixed and how.fixed_mode is False):
         if lattice is None or lattice.kind not in ("square", "rectangular"):
             raise InputError(
-                "correlation: expected holes on a square or rectangular lattice, for Eq. (mode) to "
+                "correlation: expected holes on a square or rectangular lattice, for Eq. (6) to "
                 f"start from, got {'no' if lattice is None else lattice.kind} lattice; set family "
                 "and fixed_mode to 'auto'"
             )

@@ -142,7 +142,7 @@ class Assembly:
         with_matrix: bool = True, instrument: NDArray[Any] | None = None, share: float = 1.0,
         runs: Runs | None = None,
     ) -> NormalEquations:  # fmt: skip
-        """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
+        """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (2).
 
         With brightness among the unknowns r = f - (1 + b) g(x + u) - c.
 

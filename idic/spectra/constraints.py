@@ -252,7 +252,7 @@ def _family(family: ModeFamily, ties: list[Tie]) -> str:
     if family.name.startswith("square"):
         start = ", ".join(f"{value:.3g}" for value in np.round(family.start, 3) + 0.0)
         return (
-            f"This is Eq. (mode) of the paper ({family.name}): {number(family.size, 'parameter')}, "
+            f"This is Eq. (6) of the paper ({family.name}): {number(family.size, 'parameter')}, "
             f"start [{start}]."
         )
     names = f" ({', '.join(free)})" if free else ""

@@ -164,7 +164,7 @@ def mode_family(
 
 
 def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
-    """Make the paper's Eq. (mode) with these waves (w, 5) as its start if they fit it; else None.
+    """Make the paper's Eq. (6) with these waves (w, 5) as its start if they fit it; else None.
 
     They fit if they are two near the two diagonals, |A| equal, |B| equal, and signs the same in one
     component and opposite in the other. The origin is at a junction or a hole, whichever is nearer.

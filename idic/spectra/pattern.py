@@ -1,6 +1,6 @@
-"""The pattern in a spectrum: its waves, whether Eq. (mode) fits them, equivalent mode parameters.
+"""The pattern in a spectrum: its waves, whether Eq. (6) fits them, equivalent mode parameters.
 
-The square family of modes is (Eq. (mode) of the paper), with θᵢ the arguments of its sines::
+The square family of modes is (Eq. (6) of the paper), with θᵢ the arguments of its sines::
 
     φ = a₁ [−sin θ₁ − sin θ₂] e_x + [sin θ₁ − sin θ₂] e_y
     θ₁ = π/l (a₂ x + a₃ y + a₆)        θ₂ = π/l (a₄ x + a₅ y + a₇)
@@ -67,7 +67,7 @@ def mode_deviation(
 
 
 def nearest_origin(mode: ArrayLike, pitch: float) -> ModeFamily:
-    """Make Eq. (mode) with a given mode as its start, at the origin where phases are smaller."""
+    """Make Eq. (6) with a given mode as its start, at the origin where phases are smaller."""
     found = []
     for origin in ("junction", "hole"):
         family = square_family(origin)
@@ -79,9 +79,9 @@ def nearest_origin(mode: ArrayLike, pitch: float) -> ModeFamily:
 
 
 def square_parameters(waves: FloatArray, pitch: float) -> tuple[FloatArray, float]:
-    """Find the seven parameters of Eq. (mode) and v₁ that are nearest to two waves (2, 5).
+    """Find the seven parameters of Eq. (6) and v₁ that are nearest to two waves (2, 5).
 
-    Eq. (mode) has the signs (−a₁, 1) and (−a₁, −1); other waves are moved by half their length.
+    Eq. (6) has the signs (−a₁, 1) and (−a₁, −1); other waves are moved by half their length.
     """
     waves = waves.copy()
     turned = np.sign(waves[:, 1]) != (1, -1)
@@ -164,7 +164,7 @@ class WavePattern:
 
     @property
     def family(self) -> str:
-        """Either "square, 7 parameters", if Eq. (mode) describes it, "unknown", or "none".
+        """Either "square, 7 parameters", if Eq. (6) describes it, "unknown", or "none".
 
         The square family consists of two waves near the diagonals, of equal amplitudes in x and in
         y, with the same sign in x and opposite signs in y (or the reverse).
@@ -175,7 +175,7 @@ class WavePattern:
 
 
 def read_pattern(spectrum: Spectrum) -> WavePattern:
-    """Find the waves of a long-range correlated pattern and check whether Eq. (mode) fits them."""
+    """Find the waves of a long-range correlated pattern and check whether Eq. (6) fits them."""
     peaks = find_peaks(spectrum)
     if not peaks:
         return WavePattern((), None, ("No pattern: no maximum outside the lines of the edges.",))
@@ -212,22 +212,22 @@ def _pursued(spectrum: Spectrum, peaks: list[Peak]) -> list[Peak]:
 
 
 def _described(waves: tuple[PlaneWave, ...], largest: Peak, pitch: float) -> WavePattern:
-    """Check the properties that Eq. (mode) assumes, with one line of text each."""
+    """Check the properties that Eq. (6) assumes, with one line of text each."""
     vectors = " and ".join(f"[{w.k[0]:+.3f}, {w.k[1]:+.3f}]" for w in waves)
     count = {1: "One wave", 2: "Two waves"}.get(len(waves), f"{len(waves)} waves")
     text = [f"{count}, {vectors} π/l; the largest peak is {largest.contrast:.0f} times the median."]
     if len(waves) != 2:
-        text.append("Eq. (mode) is not supported: it has two waves.")
+        text.append("Eq. (6) is not supported: it has two waves.")
         return WavePattern(waves, largest, tuple(text))
     checks = (_directions(waves), _equality(waves), _signs(waves, pitch), _standing(waves))
     text += [line for _, line in checks]
     if not all(passed for passed, _ in checks):
-        text.append("Eq. (mode) is not supported by these observations.")
+        text.append("Eq. (6) is not supported by these observations.")
         return WavePattern(waves, largest, tuple(text))
     mode, v1 = square_parameters(np.array([w.row for w in waves]), pitch)
     start, sign = mode_equivalent(mode, pitch)
     numbers = ", ".join(f"{value:.2f}" for value in np.round(start, 2) + 0.0)
-    text.append(f"Eq. (mode) is supported: {SQUARE}, start [{numbers}].")
+    text.append(f"Eq. (6) is supported: {SQUARE}, start [{numbers}].")
     return WavePattern(waves, largest, tuple(text), tuple(float(v) for v in start), sign * v1)
 
 

@@ -1,6 +1,6 @@
 """Optical distortions: polynomial, OpenCV's camera model, sampled; inverse, undistorted images.
 
-A lens shows the ideal image position p at phi_S(p) = p + S(p), the paper's Eq. (r2). Here S is in
+A lens shows the ideal image position p at phi_S(p) = p + S(p), the paper's Eq. (5). Here S is in
 px and in the image frame: components along the rows' index (down) and the columns' index (right).
 Source of the camera model, here without thin prisms and tilts:
 https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html.

@@ -3,7 +3,7 @@
 The paper says that modes are independent of the size l of the unit cell, of d/l for moderate
 variations, and of the material (Section "Graded Microstructures and Size Independence of the
 Modes"). This study quantifies it by the normalised overlap of a lattice's numerical mode at (π, π)
-with Eq. (mode).
+with Eq. (6).
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class ModeRow:
     state: float = quantity("strain of the mode's state", "-")
     """Load of the state at which the mode is computed: the first critical one, else the last."""
     eigenvalue: float = quantity("eigenvalue at (pi, pi)", "N/mm^4")
-    overlap: float = quantity("overlap with Eq. (mode)", "-")
-    """|<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both of unit norm over
+    overlap: float = quantity("overlap with Eq. (6)", "-")
+    """|<numerical, analytic>| of the lowest mode at (π, π) with Eq. (6), both of unit norm over
     the material."""
     captured: float = quantity("energy captured by the automatic family", "-")
     """Share of the mode's energy captured by the automatically found mode family."""
@@ -107,7 +107,7 @@ def read_rows(path: Path) -> tuple[ModeRow, ...]:
 PATTERN = (math.pi, math.pi)
 """The wave of the paper's pattern, as phase differences from cell to cell [rad]."""
 EQ_MODE = square_family("hole")
-"""The analytic mode, Eq. (mode) of the paper; a hole's centre is the origin."""
+"""The analytic mode, Eq. (6) of the paper; a hole's centre is the origin."""
 _STEP, _CLOSE = 0.02, 0.002  # step of the load [-]
 _NARROW = 0.005  # width of the bracket of d/l at which the first mode changes [-]
 LOADINGS: dict[str, MacroLoading] = {

@@ -40,7 +40,7 @@ from modeharvest.validation.workers import Case, Cases, Row
 PARAMETERS = tuple(f"a{k}" for k in range(1, 8))
 WAVE_VECTORS = list(PARAMETERS[1:5])
 IDEAL = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0])
-"""Parameters of Eq. (mode) with a solid junction at the origin; phases a₆ and a₇ divided by l."""
+"""Parameters of Eq. (6) with a solid junction at the origin; phases a₆ and a₇ divided by l."""
 NOISE = 0.01
 """Noise for which error bars are predicted [fraction of full scale]; the images have no noise."""
 PATTERN_SHARE = 0.8
@@ -83,7 +83,7 @@ class SpecimenPatterns:
 
 
 def deviations(measured: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
-    """Parameters minus those of Eq. (mode); phases divided by l."""
+    """Parameters minus those of Eq. (6); phases divided by l."""
     values = measured[[prefix + name for name in PARAMETERS]].to_numpy(np.float64) - IDEAL
     return pd.DataFrame(values, measured.index, list(PARAMETERS))
 
@@ -227,7 +227,7 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
         "The paper argues that the pattern of a square stacking of holes is one mode, whatever "
         "the size of its cells, nearly whatever that of its holes, and the material. Here it is "
         "measured: specimens are buckled, imaged and correlated with the mode’s parameters free, "
-        "and what is found is set against the mode of the infinite lattice, against Eq. (mode) of "
+        "and what is found is set against the mode of the infinite lattice, against Eq. (6) of "
         "the paper, and against the best fit to the specimen’s own displacement."
     )
     function: ClassVar[str] = f"{__name__}:one_specimen"

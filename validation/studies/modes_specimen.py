@@ -217,7 +217,7 @@ def lattice_mode(specimen: Specimen, material: Material, divisions: int) -> Patt
 
 
 def nearest_aspect(mode: PatternMode) -> float:
-    """The a₁ of Eq. (mode) that is nearest to a lattice's mode [-].
+    """The a₁ of Eq. (6) that is nearest to a lattice's mode [-].
 
     By symmetry and periodicity, the mode's wave vectors and phases are exactly the ideal ones. Of
     the seven parameters only a₁ can differ, the ratio of the two components' amplitudes.

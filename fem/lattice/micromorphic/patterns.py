@@ -44,7 +44,7 @@ class PlaneWaves:
     def of_sines(cls, waves: ArrayLike, half_wavelength: float, scale: float = 1.0) -> PlaneWaves:
         """From rows A, B, kx, ky [-], c [mm] (w, 5): s sum (A, B) sin(pi/l (kx x + ky y + c)).
 
-        ``half_wavelength`` is l [mm], ``scale`` is s [-]. This is Eq. (mode) and its families.
+        ``half_wavelength`` is l [mm], ``scale`` is s [-]. This is Eq. (6) and its families.
         """
         values, per_mm = np.atleast_2d(np.asarray(waves, np.float64)), np.pi / half_wavelength
         if values.ndim != 2 or values.shape[1] != 5:
@@ -69,7 +69,7 @@ class PlaneWaves:
 
 
 def rotation_pattern(pitch: float, pitch_y: float | None = None) -> PlaneWaves:
-    """The paper's Eq. (mode) for square or rectangular stacking, max |phi| = 1.
+    """The paper's Eq. (6) for square or rectangular stacking, max |phi| = 1.
 
     phi = (sin x cos y, -cos x sin y), x and y in units of l/pi and l_y/pi, with the origin at the
     centre of a hole: holes become ellipses, neighbours at right angles.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.fft import fft, ifft, irfft, next_fast_len, rfft, rfft2
 from scipy.ndimage import map_coordinates
 
 from modeharvest.idic.local.field import LocalField, field_between
@@ -194,7 +194,7 @@ def _turned(
     return np.asarray(map_coordinates(f, at, order=1, mode="nearest"), dtype=np.float32)
 
 
-def _correlation(window: FloatImage, blocks: FloatImage) -> FloatArray:
+def _correlation(window: FloatImage, blocks: FloatImage) -> FloatImage:
     """Normalised cross-correlation of blocks (n, k, k) at all places in a window (rows, cols).
 
     Like ``skimage.feature.match_template``, which would transform the window again for each block:
@@ -205,10 +205,10 @@ def _correlation(window: FloatImage, blocks: FloatImage) -> FloatArray:
     window = window - window.mean()  # for sums without loss of digits
     blocks = blocks - blocks.mean(axis=(1, 2), keepdims=True)
     rows, cols = (size - k + 1 for size in window.shape)
-    product = rfft2(window, shape) * np.conj(rfft2(blocks, shape))
-    cross = irfft2(product, shape)[:, :rows, :cols].astype(np.float64)
-    variance = np.maximum(0.0, _box_mean(window**2, k) - _box_mean(window, k) ** 2)
-    norm = np.sqrt((blocks**2).sum(axis=(1, 2)))[:, None, None] * (k * np.sqrt(variance))
+    product = rfft2(window, shape) * np.conj(fft(rfft(blocks, shape[1]), shape[0], axis=1))
+    cross = irfft(ifft(product, axis=1)[:, :rows], shape[1])[:, :, :cols]
+    deviation = np.sqrt(np.maximum(0.0, _box_mean(window**2, k) - _box_mean(window, k) ** 2))
+    norm = np.linalg.norm(blocks, axis=(1, 2), keepdims=True) * (k * deviation).astype(cross.dtype)
     there = norm > np.finfo(np.float32).eps
     return np.asarray(np.divide(cross, norm, out=np.zeros_like(cross), where=there))
 

@@ -331,7 +331,7 @@ def _branches(
 
 def draw_overlaps(rows: Sequence[ModeRow]) -> Figure:
     """Draw the overlap of the numerical with the analytic mode against d/l."""
-    return _over_ratio(rows, "overlap with Eq. (mode) [–]", lambda row: row.overlap)
+    return _over_ratio(rows, "overlap with Eq. (6) [–]", lambda row: row.overlap)
 
 
 def draw_captured(rows: Sequence[ModeRow]) -> Figure:

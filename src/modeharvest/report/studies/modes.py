@@ -30,7 +30,7 @@ from modeharvest.validation.studies.modes import (
 
 
 def parameters_summary(measured: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: a₁; deviations of wave vectors and phases from Eq. (mode)."""
+    """A row for each specimen: a₁; deviations of wave vectors and phases from Eq. (6)."""
     off, best = 100.0 * deviations(measured), 100.0 * deviations(measured, "best_")
     sds = [f"{name}_sd_model_error" for name in PARAMETERS]
     sd = 100.0 * measured[sds].set_axis(PARAMETERS, axis=1)
@@ -52,7 +52,7 @@ def parameters_table(measured: pd.DataFrame) -> pd.DataFrame:
     """A row for each parameter of each specimen; phases are divided by l."""
     rows = [
         {"varied": row["varied"], "level": row["level"], "d/l": row["ratio"], "parameter": name,
-         "Eq. (mode)": ideal, "measured": row[name],
+         "Eq. (6)": ideal, "measured": row[name],
          "± 2 sd by model error": 2.0 * row[f"{name}_sd_model_error"],
          "± 2 sd by 1 % of noise": 2.0 * row[f"{name}_sd_noise"],
          "best fit": row[f"best_{name}"],
@@ -65,7 +65,7 @@ def parameters_table(measured: pd.DataFrame) -> pd.DataFrame:
 _WAVE_COLOURS = {"a2": style.BLUE, "a3": style.GREEN, "a4": style.GOLD, "a5": style.RED}
 _PHASES = {"a6": style.BLUE, "a7": style.RED}
 _IDEAL = dict(zip(PARAMETERS, IDEAL, strict=True))
-"""Parameters of Eq. (mode) with a solid junction at the origin; phases divided by l."""
+"""Parameters of Eq. (6) with a solid junction at the origin; phases divided by l."""
 _PATTERN_END, _ERROR_END = 0.15, 0.03  # ends of the colour scales [l]
 _PAGE, _WIDEST = 8.9, 1.7  # width of all specimens together, largest width of one [in]
 _ROWS = ("truth − v₀", "measured v₁φ₁", "truth − IDIC")
@@ -125,7 +125,7 @@ _LATTICE: dict[str, Any] = {"color": style.INK, "marker": "x", "markersize": 4}
 _OVERLAPS = {
     "with the infinite lattice’s mode": {
         "overlap_lattice": ("measured", _MEASURED), "best_overlap_lattice": ("best fit", _BEST),
-        "lattice_overlap_ideal": ("Eq. (mode), ideal", _LATTICE),
+        "lattice_overlap_ideal": ("Eq. (6), ideal", _LATTICE),
     },
     "with the specimen’s own pattern": {
         "overlap_truth": ("measured", _MEASURED), "best_overlap_truth": ("best fit", _BEST),

@@ -54,7 +54,7 @@ class MeasuredMode(_Snapped):
 
 @dataclass(frozen=True)
 class AnalyticMode(_Numbered):
-    """The paper's Eq. (mode), exactly; in triangular stacking a correlation's initial guess."""
+    """The paper's Eq. (6), exactly; in triangular stacking a correlation's initial guess."""
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,7 @@ class ImageScale:
 
 @dataclass(frozen=True)
 class DistortionTable:
-    """The lens distortion S of the paper's Eq. (r2); none by default."""
+    """The lens distortion S of the paper's Eq. (5); none by default."""
 
     file: str = ""
     """File of a distortion written by modeharvest (JSON)."""

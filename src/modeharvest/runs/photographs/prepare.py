@@ -182,7 +182,7 @@ class Optics:
     """The lens."""
 
     distortion: Distortion | None = None
-    """Distortion S of the paper's Eq. (r2); None for a lens without distortion."""
+    """Distortion S of the paper's Eq. (5); None for a lens without distortion."""
     calibration: Calibration | None = None
     """The calibration that gave the distortion; None if the distortion was given."""
 
