@@ -74,6 +74,7 @@ def draw(app: Sphinx) -> None:
     """Write the pages into the documentation's source."""
     folder = Path(app.srcdir) / FOLDER / "api"
     write(folder / "modeharvest.rst", public_names())
+    listed = "- :doc:`modeharvest </generated/api/modeharvest>`: what most scripts need.\n"
     for name, modules in packages().items():
         init = SOURCE.parent.joinpath(*name.split("."), "__init__.py")
         defines = any(isinstance(n, ast.FunctionDef) for n in ast.parse(init.read_text()).body)
@@ -81,6 +82,8 @@ def draw(app: Sphinx) -> None:
         for module in modules:
             page += "\n\n" + heading(module, "-") + f".. automodule:: {name}.{module}"
         write(folder / f"{name}.rst", page + "\n")
+        listed += f"- :doc:`{name} </generated/api/{name}>`: {first_line(init)}\n"
+    write(folder / "packages.inc", listed)
 
 
 def shorten_contents(_: Sphinx, env: BuildEnvironment) -> None:
