@@ -31,6 +31,7 @@ from modeharvest.validation.scoring import score as spectra
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 from modeharvest.validation.scoring.score import (
     REGIONS,
+    Grading,
     Score,
     error_spectrum,
     ranked,
@@ -61,6 +62,18 @@ def labels(truth: BenchmarkTruth) -> NDArray[np.int8]:
 def score_of(truth: BenchmarkTruth, field: LocalField) -> Score:
     true = truth.displacement(STRAIN, field.x, field.y)
     return score(field, true, labels(truth), truth.grid)
+
+
+def test_regions_without_material_are_named(truth: BenchmarkTruth) -> None:
+    """With wide edges the ligaments of small images are all edge, and their row is empty."""
+    graded = score_of(truth, noisy(truth, 0.1, "one"))
+    for edge_px, empty in ((3, ["bulk"]), (1000, ["ligaments", "junctions", "bulk"])):  # no bulk
+        own = regions(truth.mask, truth.grid, truth.specimen, edge_px)
+        notes = Grading(truth, STRAIN, edge_px, own, (graded,), {}).notes
+        expected = [
+            f"no material is in {name}, {edge_px} px or more from any edge" for name in empty
+        ]
+        assert [note for note in notes if note.startswith("no material")] == expected
 
 
 @pytest.fixture(scope="module")

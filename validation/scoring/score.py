@@ -354,10 +354,12 @@ class Grading:
 
     @property
     def notes(self) -> list[str]:
-        """Notes for the reader: refused fields, remarks, poor coverage."""
+        """Notes for the reader: refused fields, remarks, empty regions, poor coverage."""
         return [
             *(f"not graded: {why}" for why in self.refused.values()),
             *self.remarks,
+            *(f"no material is in {name}, {self.edge_px} px or more from any edge"
+              for k, name in enumerate(REGIONS) if k not in self.labels),
             *(f"{graded.source} covers {100 * graded.covered:.0f} % of the material, less than "
               f"{100 * ENOUGH_COVERED:.0f} %, and is ranked after those that cover more"
               for graded in self.scores if graded.covered < ENOUGH_COVERED),
@@ -373,16 +375,13 @@ def grading_summary(grading: Grading) -> dict[str, Any]:
         for graded in grading.scores
     ]  # fmt: skip
     content = {
-        "format": SCORES_FORMAT,
-        "benchmark": grading.truth.id,
-        "nominal_strain": grading.strain,
-        "edge_px": grading.edge_px,
-        "percentiles": PERCENTILES,
+        "format": SCORES_FORMAT, "benchmark": grading.truth.id,
+        "nominal_strain": grading.strain, "edge_px": grading.edge_px, "percentiles": PERCENTILES,
         "covered_by_all": grading.common_share,
         "fields": fields,
         "refused": grading.refused,
         "remarks": grading.notes,
-    }
+    }  # fmt: skip
     return dict(to_plain(content))
 
 
