@@ -87,7 +87,7 @@ class _Stage:
     """The stage ends once the step's rms over nodes and a tenth of its longest are below [px]."""
 
 
-_STAGES = (_Stage(Level(2, 3.0), 120.0, 0.4), _Stage(Level(2, 1.5), 50.0, 0.4), _Stage(FULL, 30.0))
+_STAGES = (_Stage(Level(2, 3.0), 120.0, 0.2), _Stage(Level(2, 1.5), 50.0, 0.2), _Stage(FULL, 30.0))
 """Stages before the last, which uses unfiltered images and the cut-off that is searched for."""
 _LAST_TOLERANCE_PX = 0.01
 _LONGEST_STEP_PX = 8.0
