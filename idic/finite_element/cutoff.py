@@ -91,10 +91,7 @@ def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> 
 def least_risk(
     at: Linearised, first_px: float, pixel_size: float, excess: float
 ) -> tuple[Risk, ...]:
-    """Try cut-offs around ``first_px`` until the risk rises on both sides, or a bound is reached.
-
-    Returns three or more in ascending order.
-    """
+    """Try three or more, ascending, until the risk rises on both sides or a bound is reached."""
 
     def tried_at(cutoff_px: float) -> Risk:
         return risk(at, float(np.clip(cutoff_px, _LEAST_PX, _MOST_PX)), pixel_size, excess)

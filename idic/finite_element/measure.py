@@ -88,7 +88,8 @@ class _Stage:
 
 
 _STAGES = (_Stage(Level(2, 3.0), 120.0, 0.2), _Stage(Level(2, 1.5), 50.0, 0.2), _Stage(FULL, 30.0))
-"""Stages before the last, which uses unfiltered images and the cut-off that is searched for."""
+"""Stages before the last, which uses unfiltered images and the cut-off that is searched for. Coarse
+ones of tolerance 0.4 left places in local minima ("lens" in docs/how-to/scoring.md)."""
 _LAST_TOLERANCE_PX = 0.01
 _LONGEST_STEP_PX = 8.0
 """Largest change of a node's displacement in one step."""
