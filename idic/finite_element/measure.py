@@ -68,6 +68,13 @@ _LEAST_DET = 0.1
 _UNLIKE, _SEEN = 0.25, 0.25
 """Images don't match in an element whose mean square residual less noise, over the reference's
 variance, is larger, or whose share of pixels on the deformed image's material is smaller."""
+_BY_CHANCE = 5.0
+"""Largest departure of a mean square of noise from its variance [standard deviations]."""
+_SOME_PIXELS = 200
+"""So many pixels in all may not match: elements of an edge that show some background."""
+_AROUND, _AROUND_PX = 2, 60.0
+"""Layers of elements around such elements that count, too, as few speckles also match elsewhere;
+and the shortest wave of their neighbours' displacement from which they are measured again."""
 _BORDER_PX = 2.0
 """Edges closer than this to the image's border are no edges of the body [px]."""
 _ROUNDS = 3
@@ -163,6 +170,7 @@ def measure_displacement(
     course = _Measurement(pair, start, on, options or FiniteElementOptions())
     for stage in counted((*_STAGES, None), progress, "whole displacement"):
         if stage is None:
+            course.again_where_unlike(*_STAGES)
             course.regularise()
         else:
             course.through(stage)
@@ -179,10 +187,9 @@ def coarse_displacement(
     course = _Measurement(pair, start, on, options)
     for stage in (*_STAGES, _Stage(FULL, _FIRST_PX)):
         course.through(stage)
-    sums, pixels = course.linearised().sums, course._prepare(FULL).pixels
-    unlike = sums.squares > (_UNLIKE * float(pixels.grey.var()) + sum(course.noise)) * sums.weights
-    unlike |= sums.counts < _SEEN * np.diff(pixels.start)
-    return course.u.reshape(-1, 2), ~np.isin(np.arange(len(on.mesh.nodes)), on.mesh.cells[unlike])
+    unseen = course.linearised().sums.counts < _SEEN * np.diff(course._prepare(FULL).pixels.start)
+    known = on.away_from(course.unlike(), _AROUND) & on.away_from(unseen)
+    return course.u.reshape(-1, 2), known
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,6 +272,8 @@ class _Measurement:
         """Normal equations at u; after short steps the previous matrices are used again."""
         on, kept, body = self.level, self.kept, self.body
         assert on is not None
+        if kept and kept.u is self.u and kept.prior is self.prior and kept.edges is self.edges:
+            return kept
         nodal, is_new = self.u.reshape(-1, 2), kept is None
         sums = normal_equations(on.pixels, body.mesh, on.images, nodal, on.continued, is_new)
         if sums.pixels == 0:
@@ -304,6 +313,30 @@ class _Measurement:
                 self.kept = None
             if max(last := rms, 0.1 * longest) < stage.tolerance_px:
                 break
+
+    def unlike(self, at: Linearised | None = None) -> BoolArray:
+        """(m,) True for elements in which the unfiltered images don't match."""
+        grey, sums = self._prepare(FULL).pixels.grey, (at or self.linearised()).sums
+        chance = sums.weights + _BY_CHANCE * np.sqrt(2.0 * sums.weights)
+        found = sums.squares > _UNLIKE * float(grey.var()) * sums.weights + sum(self.noise) * chance
+        return np.asarray(found & (sums.counts[found].sum() > _SOME_PIXELS))
+
+    def again_where_unlike(self, *stages: _Stage) -> None:
+        """Measure again from the displacement around where images don't match, while that helps."""
+        body, wave = self.body, _AROUND_PX * self.pair.grid.pixel_size
+        while (unlike := self.unlike()).any():
+            known, last = body.away_from(unlike, _AROUND)[:, None], (self.u, self.prior)
+            start, u = (
+                np.where(known, nodal, body.smoothed(nodal, wave, known[:, 0]))
+                for nodal in (self.start, self.u.reshape(-1, 2))
+            )
+            self.prior, self.u = Smoothness(body, start), u.ravel()
+            for stage in stages:
+                self.through(stage)
+            if self.unlike().sum() >= unlike.sum():
+                (self.u, self.prior), self.kept = last, None
+                break
+            self.start = start
 
     def regularise(self) -> None:
         """Find the last cut-off wavelength and its u: without a law, then with one if given."""
@@ -369,7 +402,9 @@ class _Measurement:
                 cutoff = best_of(self.tried)
                 if abs(np.log(cutoff / before)) < _SETTLED:
                     break
-        self.through(_Stage(FULL, cutoff, _LAST_TOLERANCE_PX))
+        self.through(last := _Stage(FULL, cutoff, _LAST_TOLERANCE_PX))
+        if isinstance(self.prior, Smoothness):  # short cut-offs may lose what noisy images show
+            self.again_where_unlike(*_STAGES, last)
         self.cutoff_px = cutoff
 
     def _deformation_gradient(self) -> FloatArray:
@@ -406,7 +441,7 @@ class _Measurement:
 
     def result(self) -> NodalResult:
         """Result of the measurement, with standard deviations."""
-        at, here, sd = self._assessed()
+        (at, here, sd), body = self._assessed(), self.body
         sd = self._against_law_free(sd)
         if not (np.isfinite(self.u).all() and np.isfinite(sd.by_noise + sd.bias).all()):
             raise InputError(
@@ -421,8 +456,16 @@ class _Measurement:
                 "there the displacement is the smoothest that fits around, and its standard "
                 "deviation a guess.",
             )
+        if (unlike := self.unlike(at)).any():
+            worst = np.argmax(at.sums.squares / np.maximum(at.sums.weights, 1.0))
+            row, col = self.pair.grid.to_px(*body.mesh.nodes[body.mesh.cells[worst]].mean(axis=0))
+            self.warnings += (
+                f"Around row {row:.0f}, column {col:.0f} the images don't match (on "
+                f"{100 * counts[unlike].sum() / counts.sum():.2g} % of the material): there the "
+                "surface has changed, or the displacement is wrong.",
+            )
         return NodalResult(
-            mesh=self.body.mesh,
+            mesh=body.mesh,
             displacement=self.u.reshape(-1, 2) + sd.taken,
             standard_deviation=np.hypot(sd.by_noise, sd.bias),
             noise_deviation=sd.by_noise,
@@ -432,7 +475,7 @@ class _Measurement:
             residual_rms=at.sums.rms,
             residual_noise=here.noise,
             effective_unknowns=here.unknowns,
-            library=self.body.library,
+            library=body.library,
             **picked(self, "start cutoff_px tried warnings contradicted"),
             **picked(at.sums, "pixels outside"),
         )

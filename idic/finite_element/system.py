@@ -50,6 +50,8 @@ SAMPLES = 32
 """Number of random vectors; standard deviations estimated from them are known to 13 %."""
 SOME = 8
 """Number of random vectors where a coarser estimate suffices."""
+_UNKNOWN = 1e-9
+"""Weight of nodes with unknown displacement, which determines islands that have no others."""
 _TINY = 1e-200
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
 
@@ -198,6 +200,14 @@ class Body:
         """Assemble element vectors (m, 6, 2) to (2 n,), or (m, 6, 2 count) to (2 n count,)."""
         return nodal_sums(len(self.mesh.nodes), self.mesh.cells, parts).ravel()
 
+    def away_from(self, cells: BoolArray, layers: int = 0) -> BoolArray:
+        """(n,) True for nodes beyond the selected cells (m,) and layers of cells around them."""
+        near = np.zeros(len(self.mesh.nodes), np.bool_)
+        near[self.mesh.cells[cells]] = True
+        for _ in range(layers):
+            near[self.mesh.cells[near[self.mesh.cells].any(axis=1)]] = True
+        return ~near
+
     def energies(self, matrix: csr_array) -> float:
         """Sum of v'Av over the waves v that compare matrices A."""
         return float(np.sum(self._waves * (matrix @ self._waves)))
@@ -221,8 +231,11 @@ class Body:
         return self._factor
 
     def smoothed(self, u: FloatArray, cutoff: float, known: BoolArray | bool = True) -> FloatArray:
-        """(n, 2) u without waves shorter than a cut-off [mm], from the nodes (n,) with known u."""
-        own = np.broadcast_to(known, len(u))[:, None] * np.array([1.0, 0.0, 1.0])
+        """(n, 2) u without waves shorter than a cut-off [mm], from the nodes (n,) with known u.
+
+        Where none is known around, u itself.
+        """
+        own = np.broadcast_to(np.where(known, 1.0, _UNKNOWN), len(u))[:, None] * [1.0, 0.0, 1.0]
         one = self.pattern.assembled(np.arange(len(u))[:, None], own[..., None, None])
         R = self.smoothness
         if not R.data.any():  # a single element
