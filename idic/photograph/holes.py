@@ -199,7 +199,7 @@ class HoleLattice:
         text = [
             f"{len(self)} holes on a {self.kind} lattice, {i} x {j}, of {a:.1f} and {b:.1f} px, "
             f"turned by {self.rotation_deg:+.2f} degrees, {self.misfit_px:.2f} px rms off it; "
-            f"diameters {d.mean():.1f} ± {d.std():.1f} px."
+            f"diameters {d.mean():.2f} ± {d.std():.2f} px."
         ]
         if len(self.missing):
             text.append(f"Holes are missing at {len(self.missing)} lattice points amid them.")
