@@ -64,7 +64,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data, path = made_up.data(), tmp_path_factory.mktemp("explore") / "report.html"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "DPI", 65)
-        write_page(experiment_report(made_up.summary(data), data), path)
+        long = {"warnings": [f"/{'folder' * 30}/field.csv: expected numbers, got none"]}
+        write_page(experiment_report(made_up.summary(data) | long, data), path)
     return path
 
 

@@ -28,12 +28,14 @@ from modeharvest.report.experiment import (
 )
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import (
+    curve,
     draw_convergence,
     draw_density,
     draw_eigenvalues,
     draw_load,
     draw_waves,
     pattern_density,
+    plain_ticks,
 )
 from modeharvest.report.figures.fits import Panel
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
@@ -228,6 +230,19 @@ def test_each_level_of_the_correlation_is_a_curve(data: ExperimentData) -> None:
     assert draw_convergence(replace(data.comparisons[0].result, history=())).axes
     (axes,) = draw_convergence(replace(data.comparisons[0].result, history=history[:1])).axes
     assert [tick for tick in axes.get_xticks() if 0.5 <= tick <= 1.5] == [1.0]
+
+
+@pytest.mark.parametrize(("low", "labels"), [(0.05, {"2", "3", "5"}), (0.001, {"2", "5"})])
+def test_minor_ticks_of_long_logarithmic_axes_have_fewer_labels(
+    low: float, labels: set[str]
+) -> None:
+    drawn, axes = curve("", "")
+    axes.set(xscale="log", xlim=(low, 8.0))
+    plain_ticks(axes.xaxis)
+    drawn.canvas.draw()
+    assert {
+        tick.get_text()[-1] for tick in axes.get_xminorticklabels() if tick.get_text()
+    } == labels
 
 
 def test_the_svg_stands_on_its_own(states: list[SnapshotState]) -> None:

@@ -76,7 +76,7 @@ def test_texts_write_numbers_for_a_reader() -> None:
         ("v1 phi1 is -0.36 px rms", "v₁ φ₁ is −0.36\u00a0px rms"),
         ("≤ 1e-10, [-1, 2], below v0.", "≤ 10⁻¹⁰, [−1, 2], below v₀."),
         ("--pixel-size 0.1, frame-2.tif, v1.tif, v0_degree, 2024-11-05", None),
-        ("4.5e-05 of 0.16 l", "4.5 · 10⁻⁵ of 0.16\u00a0l"),
+        ("4.5e-05 of 0.16 l", "4.5\u00a0·\u00a010⁻⁵ of 0.16\u00a0l"),
     ],
 )
 def test_text_is_typeset(plain: str, printed: str | None) -> None:
@@ -215,7 +215,7 @@ def test_a_snapshot_to_be_wary_of_is_named(change: dict[str, Any], message: str)
         (None, "–"), (float("nan"), "–"), (float("inf"), "∞"), (0, "0"), (-1.0, "−1"),
         (1971562, "1\u202f971\u202f562"), (0.256, "0.256"), (-9.62694, "−9.627"),
         (1.1368e-12, "1.1 · 10⁻¹²"), ("converged", "converged"), (True, "True"),
-        ("-1.20e-05", "−1.20 · 10⁻⁵"), ("-1_a", "-1_a"),
+        ("-1.20e-05", "−1.20\u00a0·\u00a010⁻⁵"), ("-1_a", "-1_a"),
     ],
 )  # fmt: skip
 def test_numbers_are_written_for_readers(value: object, written: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, cast
 
@@ -234,14 +235,15 @@ def plain_ticks(*axes: Axis) -> None:
     """Label logarithmic axes with 20 rather than 2 x 10^1, and powers of ten without mathtext."""
     for axis in axes:
         axis.set_major_formatter(FuncFormatter(_plain))
-        axis.set_minor_formatter(FuncFormatter(_plain))
+        axis.set_minor_formatter(FuncFormatter(partial(_plain, axis=axis)))
         axis.set_tick_params(which="minor", labelsize=7, labelcolor=INK)
 
 
-def _plain(value: float, _: object) -> str:
+def _plain(value: float, _: object, axis: Axis | None = None) -> str:
     mantissa, power = f"{value:.0e}".split("e")
+    low, high = axis.get_view_interval() if axis else (1.0, 1.0)
     if -3 <= int(power) <= 4:
-        return f"{value:g}" if mantissa in "1235" else ""
+        return f"{value:g}" if mantissa in ("1235" if high < 500.0 * low else "125") else ""
     return ten_to(int(power)) if mantissa == "1" else ""
 
 

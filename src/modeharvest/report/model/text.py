@@ -18,6 +18,7 @@ from modeharvest.fem.materials import Ogden
 
 NBSP = "\N{NO-BREAK SPACE}"
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]\d+)?")
+_JOINED = r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) |(?<=\d) (?=l\b|· 10)|(?<=\d ·) (?=10)"
 _INDICES = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
@@ -159,7 +160,7 @@ def typeset(text: str) -> str:
     new = re.sub(r"(?<![\w./-])(v|phi|φ)(\d)(?![\w/]|\.\w)", _symbol, new)
     new = re.sub(r"(?<=\d) x (?=\d)", f"{NBSP}×{NBSP}", new)
     new = re.sub(r"(?<![\w.)/-])-(?=\d)", "−", new)
-    return type(text)(re.sub(r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) |(?<=\d) (?=l\b)", NBSP, new))
+    return type(text)(re.sub(_JOINED, NBSP, new))
 
 
 def indexed(name: str) -> str:
