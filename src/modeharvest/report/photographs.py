@@ -382,7 +382,7 @@ def _amplitude_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[
          "v": f"{_micro(mode['v_max_mm'], 4)} {_two_errors(mode)}"}
         for frame in frames for i, mode in enumerate(frame["modes"], start=1)
     ]  # fmt: skip
-    return Card.tabular(ReportTable.of("amplitudes", rows), wide=len(frames) > 1)
+    return Card.tabular(ReportTable.of("amplitudes", rows), wide=True)
 
 
 def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
@@ -429,7 +429,7 @@ def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]
                 rows.append({"photograph": names[frame["name"]] if i == w == 1 else "", "xi1": xi1,
                              "xi2": xi2, "wave": indexed(f"φ{i}: {w}") + remark})  # fmt: skip
     words = text_of("photographs-waves")
-    return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=len(frames) > 1)
+    return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=True)
 
 
 def _contour_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
