@@ -9,8 +9,9 @@ in a separate folder in OUT; finished commands are not repeated. ``compare`` com
 and texts in the JSON, CSV, HDF5, NPZ and TIFF files of BEFORE, and the points and point data of VTU
 files; ``scripts/renamed_outputs.toml`` has the new names of renamed ones. Pages, pictures,
 durations, software versions, digests and files named by a digest (tables repeat their content) are
-left out. New values and changed sentences are listed, but don't count as differences. The exit code
-is 1 if anything else is missing or differs by more than the tolerance (relative; absolute below 1).
+left out. New files and values and changed sentences are listed, but don't count as differences. The
+exit code is 1 if anything else is missing or differs by more than the tolerance (relative; absolute
+below 1).
 """
 
 from __future__ import annotations
@@ -176,19 +177,24 @@ def alternatives(key: str) -> list[str]:
     return ["/".join(parts) for parts in product(*(part.split("|") for part in key.split("/")))]
 
 
-def compare(before: Path, after: Path, tolerance: float) -> int:
-    """Print all differences; return their number, without new values and changed sentences."""
-    renamed, as_is, differences, values = Renamed(RENAMED), Renamed(Path()), 0, 0
-    files = [
-        path
-        for path in sorted(before.rglob("*"))
+def compared(folder: Path) -> list[Path]:
+    """The files of a folder that are compared, relative to it."""
+    return [
+        path.relative_to(folder)
+        for path in sorted(folder.rglob("*"))
         if path.suffix in READ
         and path.name not in NOT_COMPUTED
-        and not any(DIGEST.fullmatch(Path(p).stem) for p in path.relative_to(before).parts)
+        and not any(DIGEST.fullmatch(Path(p).stem) for p in path.relative_to(folder).parts)
     ]
-    for old in files:
-        path = old.relative_to(before)
-        new = after / renamed.path(path)
+
+
+def compare(before: Path, after: Path, tolerance: float) -> int:
+    """Print all differences; return their number, without what is new and changed sentences."""
+    renamed, as_is, differences, values = Renamed(RENAMED), Renamed(Path()), 0, 0
+    files, added = compared(before), set(compared(after))
+    for path in files:
+        old, new = before / path, after / renamed.path(path)
+        added.discard(renamed.path(path))
         if not new.exists():
             print(f"{path}: missing")
             differences += 1
@@ -203,6 +209,8 @@ def compare(before: Path, after: Path, tolerance: float) -> int:
                 differences += not what.startswith(PROSE)
         for key in now:
             print(f"{path}: {key}: new")
+    for path in sorted(added):
+        print(f"{path}: new file")
     print(f"{len(files)} files, {values} values and arrays compared: {differences} differences")
     return differences
 

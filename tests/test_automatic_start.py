@@ -122,7 +122,7 @@ def test_hole_centres_are_used_and_strays_set_aside(images: ImageSet) -> None:
     domain = Box.centred(15.2, 20.8)
     motion, message = first_motion(domain, pair, LocalField(*centres.T, u))
     assert "the motion of 59 hole centres: a polynomial of degree 3" in message
-    assert "2 of 118 components set aside" in message
+    assert "2 of 118 components are outliers" in message
     off = motion(np.stack(np.meshgrid(grid.x, grid.y), -1)) - images.truth(0.128).displacement
     # The best cubic through all the material leaves 2.0 px, the pattern; here the solid strips
     # beyond the holes are extrapolated.

@@ -21,9 +21,11 @@ from explored import content_of, quantity, samples, unpacked
 from html_page import Page
 from numpy.typing import NDArray
 
+from modeharvest.report import explore
 from modeharvest.report.experiment import experiment_report
 from modeharvest.report.explore import LENGTH_STEP, Packer
 from modeharvest.report.figures import style
+from modeharvest.report.model import output
 from modeharvest.report.model.output import write_page
 
 FLOATS = NDArray[np.float64]
@@ -62,7 +64,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data, path = made_up.data(), tmp_path_factory.mktemp("explore") / "report.html"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "DPI", 65)
-        write_page(experiment_report(made_up.summary(data), data), path)
+        long = {"warnings": [f"/{'folder' * 30}/field.csv: expected numbers, got none"]}
+        write_page(experiment_report(made_up.summary(data) | long, data), path)
     return path
 
 
@@ -85,6 +88,24 @@ def test_the_page_forbids_the_browser_to_load_anything(page: Path) -> None:
     assert policy.startswith("default-src 'none'; ")
     assert not re.search(r"https?:|connect-src|\*", policy)
     assert not re.search(r"<script[^>]* src=", text)
+
+
+@pytest.mark.parametrize(("spare", "factor"), [(1, 1), (-15_000, 2), (-80_000, 1)])
+def test_samples_are_fewer_where_that_makes_a_page_small_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spare: int, factor: int
+) -> None:
+    data, path = made_up.data(), tmp_path / "report.html"
+    monkeypatch.setattr(explore, "MOST_SAMPLES", 2 * 10 * int(made_up.MASK.sum()))
+    report = experiment_report(made_up.summary(data), data)
+    assert report.explore is not None
+    pictures = {figure.name: 1000 * " " for figure in report.figures}
+    most = sum(map(len, pictures.values())) + len(report.explore(1.0)) + spare
+    monkeypatch.setattr(output, "MOST_BYTES", most)
+    write_page(report, path, pictures=pictures)
+    text = path.read_text("utf-8")
+    assert content_of(text)["factor"] == factor
+    (shown,) = re.findall(r'(?s)<section id="explore".*</script>', text)
+    assert (len(shown) + sum(map(len, pictures.values())) <= most) == (spare > -80_000)
 
 
 def test_every_quantity_has_colours_in_every_state(content: Any) -> None:

@@ -140,7 +140,7 @@ def test_words_of_users_are_escaped_and_reported(text: str) -> None:
     assert "Made up &lt;for tests&gt;" in text
     assert "expected an image &lt;of 290 x 250 px&gt;, got a damaged file" in text
     assert "<for tests>" not in text
-    for message in ("The material was found by its speckle.", "v0 starts from the local DIC.",
+    for message in ("The material was found by its speckle.", "v₀ starts from the local DIC.",
                  "S is a polynomial of degree 3", "measured from 3 exposures",
                  "modeharvest harvest EXPERIMENT.toml"):  # fmt: skip
         assert message in text

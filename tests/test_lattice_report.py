@@ -153,7 +153,7 @@ def test_a_mode_is_no_equilibrium_and_a_small_pattern_is_magnified(tmp_path: Pat
     assert mode.stable is None
     small = replace(mode, displacement=0.1 * mode.displacement, stable=True)
     text = page(replace(run, patterns=(mode, small)), tmp_path)
-    assert "a mode, no equilibrium; largest displacement 0.16 l" in text
+    assert "a mode, no equilibrium; largest displacement 0.16\u00a0l" in text
     # drawn with 0.12 l instead of 0.016 l
     assert "stable; fluctuation × 7.5" in text
 

@@ -506,6 +506,7 @@ def test_modes_of_a_part_in_view(photographed: Path, tmp_path: Path) -> None:
     summary = harvest(path, tmp_path / "out")
     assert faults(summary, "harvest") == []
     assert any("Not all of the specimen is in view" in text for text in summary["warnings"])
+    assert summary["frames"][0]["has_pattern"]  # as large over w as where the ansatz is fitted
     result = Result.read(tmp_path / "out/results/g.json")
     found = read_result(tmp_path / "out/whole_field/g.h5").displacement_on()
     mask = read_mask(tmp_path / "out/prepared/reference_mask.tif")

@@ -19,18 +19,27 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.waves import PlaneWave
-from modeharvest.report.experiment import ExperimentData, SnapshotState, draw_hero, snapshot_panels
+from modeharvest.report.experiment import (
+    ExperimentData,
+    SnapshotState,
+    draw_hero,
+    experiment_figures,
+    snapshot_panels,
+)
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import (
+    curve,
     draw_convergence,
     draw_density,
     draw_eigenvalues,
     draw_load,
+    draw_waves,
     pattern_density,
+    plain_ticks,
 )
 from modeharvest.report.figures.fits import Panel
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
-from modeharvest.report.figures.style import BLUE, INK, MUTED, SIGNED, to_svg
+from modeharvest.report.figures.style import BLUE, INK, MUTED, SIGNED, style, to_svg
 
 UNITS = {"µm", "mm⁶"}
 FRACTIONS = {"image", "residual"}  # of full scale
@@ -57,6 +66,21 @@ def colour_bar_units(drawn: Figure) -> list[str]:
 def pixels(drawn: Figure) -> NDArray[np.uint8]:
     drawn.canvas.draw()
     return np.asarray(drawn.canvas.buffer_rgba())  # type: ignore[attr-defined]  # Agg's own
+
+
+def test_no_label_is_cut_off(data: ExperimentData) -> None:
+    """All text lies in its figure, as narrow screens show nothing beyond it."""
+    draws = {figure.name: figure.draw for figure in experiment_figures(data)}
+    wave = {"xi": [0.5001, 0.5002], "sd_noise": None, "sd_model_error": None}
+    mode = {"waves": [wave], "fixed": False, "observable": True}
+    draws["waves"] = lambda: draw_waves([{"strain": s, "modes": [mode]} for s in (0.1, 0.12)])
+    for name, draw in draws.items():
+        with style():
+            drawn = draw()
+            pixels(drawn)
+            box = drawn.get_tightbbox()
+        over = np.maximum(-box.min, box.max - drawn.get_size_inches())
+        assert over.max() < 0.02, f"{name}: {over} in"
 
 
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel.key)
@@ -204,6 +228,21 @@ def test_each_level_of_the_correlation_is_a_curve(data: ExperimentData) -> None:
     drawn = np.concatenate([np.asarray(line.get_ydata()) for line in curves])
     np.testing.assert_array_equal(drawn, [step.step_px for step in history])
     assert draw_convergence(replace(data.comparisons[0].result, history=())).axes
+    (axes,) = draw_convergence(replace(data.comparisons[0].result, history=history[:1])).axes
+    assert [tick for tick in axes.get_xticks() if 0.5 <= tick <= 1.5] == [1.0]
+
+
+@pytest.mark.parametrize(("low", "labels"), [(0.05, {"2", "3", "5"}), (0.001, {"2", "5"})])
+def test_minor_ticks_of_long_logarithmic_axes_have_fewer_labels(
+    low: float, labels: set[str]
+) -> None:
+    drawn, axes = curve("", "")
+    axes.set(xscale="log", xlim=(low, 8.0))
+    plain_ticks(axes.xaxis)
+    drawn.canvas.draw()
+    assert {
+        tick.get_text()[-1] for tick in axes.get_xminorticklabels() if tick.get_text()
+    } == labels
 
 
 def test_the_svg_stands_on_its_own(states: list[SnapshotState]) -> None:

@@ -26,9 +26,9 @@ from modeharvest.report.experiment import (
     snapshot_panels,
 )
 from modeharvest.report.figures import fits
-from modeharvest.report.model.content import KeyNumber
+from modeharvest.report.model.content import KeyNumber, ReportTable
 from modeharvest.report.model.output import draw_figures, print_report, write_page
-from modeharvest.report.model.text import Measured, fixed, number, text_of
+from modeharvest.report.model.text import Measured, fixed, indexed, number, text_of, typeset
 
 
 def report(data: ExperimentData, folder: Path, summary: dict[str, Any]) -> str:
@@ -68,6 +68,19 @@ def test_texts_write_numbers_for_a_reader() -> None:
     assert words.endswith(" 1.530 N·mm/mm.")
     key = KeyNumber.of("cutoff", last={"cutoff_px": 12.3456})
     assert (key.name, key.value, key.unit) == ("cut-off wavelength", "12.3", "px")
+
+
+@pytest.mark.parametrize(
+    ("plain", "printed"),
+    [
+        ("v1 phi1 is -0.36 px rms", "v₁ φ₁ is −0.36\u00a0px rms"),
+        ("≤ 1e-10, [-1, 2], below v0.", "≤ 10⁻¹⁰, [−1, 2], below v₀."),
+        ("--pixel-size 0.1, frame-2.tif, v1.tif, v0_degree, 2024-11-05", None),
+        ("4.5e-05 of 0.16 l", "4.5\u00a0·\u00a010⁻⁵ of 0.16\u00a0l"),
+    ],
+)
+def test_text_is_typeset(plain: str, printed: str | None) -> None:
+    assert typeset(plain) == (printed or plain)
 
 
 def test_every_panel_is_there_for_every_snapshot(text: str) -> None:
@@ -202,10 +215,18 @@ def test_a_snapshot_to_be_wary_of_is_named(change: dict[str, Any], message: str)
         (None, "–"), (float("nan"), "–"), (float("inf"), "∞"), (0, "0"), (-1.0, "−1"),
         (1971562, "1\u202f971\u202f562"), (0.256, "0.256"), (-9.62694, "−9.627"),
         (1.1368e-12, "1.1 · 10⁻¹²"), ("converged", "converged"), (True, "True"),
+        ("-1.20e-05", "−1.20\u00a0·\u00a010⁻⁵"), ("-1_a", "-1_a"),
     ],
 )  # fmt: skip
 def test_numbers_are_written_for_readers(value: object, written: str) -> None:
     assert number(value) == written
+
+
+def test_columns_of_signed_numbers_are_numeric() -> None:
+    rows = [["a", "+0.3", "–", "x1"], ["b", "-0.25", "−4", "1"]]
+    assert ReportTable("", ["", "", "", ""], rows).numeric == [False, True, True, False]
+    assert indexed("a7 of φ1") == "a₇ of φ₁"
+    assert indexed("largest |v2|") == "largest |v₂|"
 
 
 def test_numbers_are_rounded_to_the_digits_asked_for() -> None:

@@ -80,7 +80,9 @@ def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:
     loading = list(moments[: last + 1])
     shown = [m for m in loading if m.has_pattern]
     if not shown:
-        return Buckling(nan, nan, nan, "No image shows a pattern that stands out of its noise.")
+        return Buckling(
+            nan, nan, nan, "No image shows a pattern that stands out of noise and model error."
+        )
     first, estimate = shown[0], _pitchfork(shown)
     at_first = f"{100 * first.strain:.2f} %"
     plain = [m for m in loading if not m.has_pattern and m.strain < first.strain]

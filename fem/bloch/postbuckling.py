@@ -108,7 +108,7 @@ class _Tracing:
                 why += "for this one mesh one sector of the cell, and turn and mirror it"
             return f"not followed from the load {start.load:.6g} on: {why}"
         way = "rises" if self.points[1].load > start.load else "falls"
-        text = f"the load {way} from {start.load:.6g} on; followed to {last.load:.6g}, "
+        text = f"the load {way} from {start.load:.4g} on; followed to {last.load:.4g}, "
         text += f"amplitude {last.amplitude:.4g} mm"
         text += f"; {self.stopped}" if self.stopped else ""
         met = {state.load for state in states}

@@ -139,7 +139,7 @@ def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
     fit = fit_unknowns(slow, np.zeros(slow.size), holes, degree)
     return partial(slow.displacement_at, fit.coefficients), (
         f"v0 starts from the motion of {count} hole centres: a polynomial of degree {degree} "
-        f"leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} of {2 * count} components set aside."
+        f"leaves {1e3 * fit.sd:.0f} µm; {fit.outliers} of {2 * count} components are outliers."
     )
 
 

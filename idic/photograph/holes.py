@@ -196,10 +196,11 @@ class HoleLattice:
     def text(self) -> tuple[str, ...]:
         """What was found."""
         d, (i, j), (a, b) = self.diameters, self.counts, np.linalg.norm(self.vectors, axis=1)
+        turn = round(self.rotation_deg, 2) + 0.0  # not −0.00
         text = [
             f"{len(self)} holes on a {self.kind} lattice, {i} x {j}, of {a:.1f} and {b:.1f} px, "
-            f"turned by {self.rotation_deg:+.2f} degrees, {self.misfit_px:.2f} px rms off it; "
-            f"diameters {d.mean():.1f} ± {d.std():.1f} px."
+            f"turned by {turn:+.2f} degrees, {self.misfit_px:.2f} px rms off it; "
+            f"diameters {d.mean():.2f} ± {d.std():.2f} px."
         ]
         if len(self.missing):
             text.append(f"Holes are missing at {len(self.missing)} lattice points amid them.")

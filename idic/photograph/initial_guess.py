@@ -99,7 +99,7 @@ def initial_guess(
         text = [motion_text, f"Without a local DIC: {local.x.size} points of {local.source}."]
     else:
         share = 100 * local.valid_share
-        text = [f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid."]
+        text = [f"Local field ({local.source}): {local.x.size} points, {share:.1f} % valid."]
         text += [local.read_as] * bool(local.convention)
     patterns = tuple(read_pattern(measured_spectrum(local, cell_size, box)) for box in boxes)
     modes: list[tuple[ModeFamily, Box]] = []
@@ -128,8 +128,8 @@ def initial_guess(
     count = 0 if ansatz.fixed else len(modes)
     fitted = " and ".join(["v0", *(f"v{i + 1}" for i in range(count))])
     text.append(
-        f"{fitted} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
-        "aside."
+        f"{fitted} fitted to the field: an sd of {1e3 * fit.sd:.0f} µm remains; {fit.outliers} "
+        "components are outliers and left out."
     )
     return InitialGuess(ansatz, fit.coefficients, patterns, local, tuple(text))
 

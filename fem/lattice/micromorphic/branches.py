@@ -97,7 +97,7 @@ def homogenize(
         if here.load >= pending[0] - 1e-12:
             met.append(here)
             pending.pop(0)
-    outcome = outcome or f"followed to the load {met[-1].load:.6g}"
+    outcome = outcome or f"followed to the load {met[-1].load:.4g}"
     known = tuple(met), tuple(criticals), outcome, path.linearisations
     return Homogenized(*known, tuple(ranked))
 
@@ -143,7 +143,7 @@ def follow_branch(
         if state is None or reached < 0.2 * amplitude:
             reach = 0.5 * (points[-1].amplitude + amplitude)
             if reach - points[-1].amplitude < _SHORTEST * first:
-                return found, f"no equilibrium beyond the load {points[-1].load:.6g}"
+                return found, f"no equilibrium beyond the load {points[-1].load:.4g}"
             continue
         rate = float(weights @ state.rate[: path.body.free_count])
         points.append(BranchPoint(reached, state.load, 1 / rate, state.value, state.rate / rate))
@@ -151,7 +151,7 @@ def follow_branch(
         if is_near:
             found.append(state)
             progress(state.load, loads[-1], "buckled branch")
-    return found, f"followed to the load {points[-1].load:.6g}"
+    return found, f"followed to the load {points[-1].load:.4g}"
 
 
 def _combined(

@@ -41,6 +41,7 @@ from modeharvest.report.model.text import (
     number,
     percent,
     text_of,
+    typeset,
 )
 from modeharvest.util.typed import headings
 from modeharvest.validation.summary import SnapshotSummary
@@ -292,7 +293,8 @@ def _symbol(snapshot: Snapshot) -> str:
 def expected_cards(name: str, rows: Sequence[Mapping[str, Any]]) -> list[Card]:
     """The table ``name`` of obtained and expected values, and whether each is met; or no card."""
     marks = {True: Mark("✓ met", True), False: Mark("✗ missed", False), None: None}
-    records = [{**row, "unit": row["unit"].replace("-", "–"), "ok": marks[row["ok"]]}
+    records = [{**row, "unit": row["unit"].replace("-", "–"), "ok": marks[row["ok"]],
+                **{key: typeset(str(row[key])) for key in ("quantity", "expected")}}
                for row in rows]  # fmt: skip
     return Card.tabular(ReportTable.of(name, records), wide=True)
 

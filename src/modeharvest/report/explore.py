@@ -193,9 +193,9 @@ def _ends(state: ExploredState, terms: Sequence[Mapping[str, float]]) -> list[fl
     return [float(f"{end:.6g}") for end in ends] or None
 
 
-def _frame(boundary: MeshBoundary, grid: PixelGrid, arrays: int, material_px: int) -> MapFrame:
-    """Finest frame for a number of arrays, each of ``material_px`` pixels, that fits on a page."""
-    factor = max(1, int(np.ceil(np.sqrt(arrays * material_px / MOST_SAMPLES))))
+def _frame(boundary: MeshBoundary, grid: PixelGrid, values: int, coarser: float) -> MapFrame:
+    """Frame for arrays of that many pixels altogether: the finest, or one that much coarser."""
+    factor = max(1, int(np.ceil(coarser * np.sqrt(values / MOST_SAMPLES))))
     return MapFrame.of(boundary, grid, max(1, max(grid.shape) // factor))
 
 
@@ -209,12 +209,13 @@ class KnownFields:
     residual: Callable[[MapFrame], NDArray[Any]] | None = None
 
 
-def explored_fits(states: Sequence[S], known_of: Callable[[S], KnownFields]) -> str:
+def explored_fits(states: Sequence[S], known_of: Callable[[S], KnownFields], coarser: float) -> str:
     """HTML to explore fits to images of one specimen, with errors if the truth is known."""
     view, modes = states[0].view, max(len(s.result.ansatz.modes) for s in states)
     known = [known_of(s) for s in states]
     arrays = 7 + 3 * modes + 3 * any(k.whole is not None for k in known)
-    frame = _frame(view.boundary, view.grid, len(states) * arrays, int(view.mask.sum()))
+    values = len(states) * arrays * int(view.mask.sum())
+    frame = _frame(view.boundary, view.grid, values, coarser)
     material = view.mask[np.ix_(*frame.pixels)]
     made = [
         ExploredState(
@@ -246,7 +247,9 @@ def _fitted(state: FittedState, known: KnownFields, frame: MapFrame) -> dict[str
     return arrays
 
 
-def explored_photographs(states: Sequence[S], truth_of: Any, residual_of: Any) -> str:
+def explored_photographs(
+    states: Sequence[S], truth_of: Any, residual_of: Any, coarser: float
+) -> str:
     """HTML to explore fits to photographs, with errors if these were simulated."""
 
     def known(state: Any) -> KnownFields:
@@ -254,14 +257,16 @@ def explored_photographs(states: Sequence[S], truth_of: Any, residual_of: Any) -
         u, best = (true.displacement, true.best) if true else (None, None)
         return KnownFields(u, best, whole.measured if whole else None, partial(residual_of, state))
 
-    return explored_fits(states, known)
+    return explored_fits(states, known, coarser)
 
 
-def explored_images(results: Mapping[str, NodalResult], unit: str, residual: Any) -> str:
+def explored_images(
+    results: Mapping[str, NodalResult], unit: str, residual: Any, coarser: float
+) -> str:
     """HTML to explore images measured on one mesh; with residuals if there are at most _FEW."""
     names = [*results][:: -(1 + len(results) // _STATES)][::-1]  # every n-th, including the last
     one, made = results[names[0]], []
-    frame = _frame(MeshBoundary.of(one.mesh), one.grid, 7 * len(names), one.pixels)
+    frame = _frame(MeshBoundary.of(one.mesh), one.grid, 7 * len(names) * one.pixels, coarser)
     grid = middle_pixels(frame, one.grid)
     for n, (name, result) in enumerate((name, results[name]) for name in names):
         strain = result.on_pixels(result.field("logarithmic"), grid)
@@ -274,11 +279,13 @@ def explored_images(results: Mapping[str, NodalResult], unit: str, residual: Any
     return Explorer("measure", frame, one.grid, made, unit).html()
 
 
-def explored_scores(grading: Grading, nearest: Callable[[MapFrame, Score], IntArray]) -> str:
+def explored_scores(
+    grading: Grading, nearest: Callable[[MapFrame, Score], IntArray], coarser: float
+) -> str:
     """HTML to explore graded fields; ``nearest``: index of the point shown in each map cell."""
     truth, made = grading.truth, []
-    boundary, arrays = MeshBoundary.of(truth.solution.mesh), 4 * len(grading.scores)
-    frame = _frame(boundary, truth.grid, arrays, int(truth.mask.sum()))
+    count = 4 * len(grading.scores) * int(truth.mask.sum())
+    frame = _frame(MeshBoundary.of(truth.solution.mesh), truth.grid, count, coarser)
     at = replace(frame, grid=middle_pixels(frame, truth.grid))
     for n, graded in enumerate(grading.scores):
         true = truth.displacement(grading.strain, graded.x, graded.y)

@@ -136,7 +136,10 @@ def draw_regions(scores: Sequence[Score]) -> Figure:
         rms = [graded.by_region[name].rms_px for name in REGIONS]
         axes.bar(at, np.nan_to_num(rms), 0.92 * width, color=style.colour(n), label=graded.source)
     axes.set_xticks(range(len(REGIONS)), REGIONS)
-    if any(graded.everywhere.rms_px > 0 for graded in scores):
+    known = [
+        part.rms_px for graded in scores for part in graded.by_region.values() if part.rms_px > 0
+    ]
+    if known and max(known) > 10.0 * min(known):
         axes.set_yscale("log")
     return _finished(drawn)
 

@@ -143,15 +143,15 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
 def _response_cards(data: HomogenizationData | None) -> list[Card]:
     if data is None:
         return []
-    quantities = {"force_N_per_mm": ("force", "force per thickness [N/mm]"),
-                  "energy_N": ("energy", "stored energy per thickness [N]")}  # fmt: skip
+    quantities = [("force", "force_N_per_mm", "force per thickness [N/mm]"),
+                  ("energy", "energy_N", "stored energy per thickness [N]")]  # fmt: skip
     response, first = data.found["response"], data.found["first_order_critical_strain"]
     direct = data.direct.critical_strain
-    return [Card("Force and energy", [
-        ReportFigure(f"response-{name}", "",
-                     partial(figures.draw_response, data.path, direct, response, first, key, label))
-        for key, (name, label) in quantities.items()
-    ], wide=True, caption=text_of("homogenized-response"))]  # fmt: skip
+    draw = partial(figures.draw_response, data.path, direct, response, first)
+    made = {n: ReportFigure(f"response-{n}", "", partial(draw, *of), wide=True)
+            for n, *of in quantities}  # fmt: skip
+    words = text_of("homogenized-response")
+    return [Card(name.capitalize(), [figure], caption=words) for name, figure in made.items()]
 
 
 def _amplitude_cards(data: HomogenizationData | None) -> list[Card]:

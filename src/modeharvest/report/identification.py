@@ -52,7 +52,8 @@ def identification_report(
         kind="identification",
         title=summary["title"],
         findings=[
-            *(text_of("identified-parameter", **p) for p in parameters if p["sd"] is not None),
+            *(text_of("identified-parameter", **p, of_unit=f" {p['unit']}".removesuffix(" -"))
+              for p in parameters if p["sd"] is not None),
             *summary["statements"],
             text_of("identified-outcome", **summary),
         ],
@@ -68,7 +69,7 @@ def identification_report(
                 *_hole_cards(summary),
             ]),
             Section.of("identified-states", [
-                *_force_cards(summary, found), *_residual_cards(found, data),
+                *_force_cards(summary, found), *_residual_cards(summary, found, data),
                 *Card.tabular(states, wide=True),
             ]),
         ],
@@ -118,7 +119,7 @@ def _force_cards(summary: Summary, found: Identified | None) -> list[Card]:
     if found is None:
         return []
     draw = partial(_draw_force, summary["states"], summary["force_sd_N_per_mm"])
-    figure = ReportFigure("force", "", draw)
+    figure = ReportFigure("force", "", draw, wide=True)
     return [Card("Force against strain", [figure], caption=text_of("identified-force"))]
 
 
@@ -144,7 +145,7 @@ def _hole_cards(summary: Summary) -> list[Card]:
     off = np.array([hole["off"] for hole in holes])
     largest = max(np.abs(off[:, :2]).max(), 0.5 * np.abs(off[:, 2:]).max(), 1e-12)
     times = float(f"{_HOLES_SHOWN * holes[0]['diameter'] / largest:.1g}")
-    figure = ReportFigure("holes", "", partial(_draw_holes, holes, times))
+    figure = ReportFigure("holes", "", partial(_draw_holes, holes, times), wide=True)
     sd = np.array([hole["off_sd"] for hole in holes])
     known = zip(1e3 * np.sqrt(np.mean(sd**2, axis=0)), _PARTS, strict=True)
     words = ", ".join(f"{microns:.1f} µm in {part}" for microns, part in known if microns)
@@ -169,16 +170,16 @@ def _draw_holes(holes: Sequence[Mapping[str, Any]], times: float) -> Figure:
 
 
 def _residual_cards(
-    found: Identified | None, data: Sequence[StateObservation | None]
+    summary: Summary, found: Identified | None, data: Sequence[StateObservation | None]
 ) -> list[Card]:
     if found is None:
         return []
-    figures = []
+    figures, unit = [], "levels" if summary["case"]["data"] else "full scale"
     for k, (state, part) in enumerate(zip(found.states, data, strict=False), start=1):
         if isinstance(part, ImageData):
             frame = MapFrame.of(MeshBoundary.of(part.pixels.mesh), part.pair.grid)
             field = frame.average(part.residual(state))
-            draw = partial(draw_field, frame, field, ColourScale.signed(field, "levels", 0.999))
+            draw = partial(draw_field, frame, field, ColourScale.signed(field, unit, 0.999))
             figures.append(ReportFigure(f"residual-{k}", f"{100 * state.strain:.4g} %", draw))
     text = text_of("identified-residual")
     return [Card("Residual f − g(x + u)", figures, caption=text)] if figures else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -134,7 +135,7 @@ def findings(summary: Summary) -> list[str]:
     """The results in sentences."""
     text, point, load = [], summary["critical"], LoadQuantity(**summary["load"])
     if point is not None and point["found"]:
-        text.append(text_of("lattice-critical", point=point, load=load,
+        text.append(text_of("lattice-critical", under=_under(point["loading"]), load=load,
                             at=load.text(point["load"], 5), waves=waves_text(point),
                             proof=proof(point)))  # fmt: skip
         if point["error"] is not None:
@@ -142,7 +143,7 @@ def findings(summary: Summary) -> list[str]:
             text.append(text_of("lattice-error", load=load, error=error, order=point["order"],
                                 share=point["error"] / point["load"]))  # fmt: skip
     elif point is not None:
-        text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
+        text.append(f"Under {_under(point['loading'])}: {summary['outcome']}; {proof(point)}.")
     for part in summary["zone"]:
         at = load.text(part["load"])
         text.append(text_of("lattice-zone", name=wave_name(part["wave"]), at=at, **part))
@@ -154,6 +155,11 @@ def findings(summary: Summary) -> list[str]:
         text.append(text_of("lattice-study", plural=plural, **study))
     text.append(f"The lattice is of the {material_text(summary['case']['material'])}.")
     return text
+
+
+def _under(loading: str) -> str:
+    """A loading's description in a sentence: "uniaxial loading along x"."""
+    return re.sub(r"(?= along|,|$)", " loading", loading, count=1)
 
 
 def _splitting(point: Mapping[str, Any] | None) -> list[str]:

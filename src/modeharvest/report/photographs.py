@@ -27,7 +27,16 @@ from modeharvest.report.model.content import (
     ReportTable,
     Section,
 )
-from modeharvest.report.model.text import Cell, Mark, Measured, caption, number, percent, text_of
+from modeharvest.report.model.text import (
+    Cell,
+    Mark,
+    Measured,
+    caption,
+    indexed,
+    number,
+    percent,
+    text_of,
+)
 from modeharvest.runs.photographs.results import Harvest
 
 Summary = Mapping[str, Any]
@@ -367,13 +376,13 @@ def _frame_numbers(frame: Frame) -> dict[str, Cell]:
 
 def _amplitude_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
     rows = [
-        {"photograph": names[frame["name"]], "mode": f"φ{i}",
+        {"photograph": names[frame["name"]], "mode": indexed(f"φ{i}"),
          "state": "not " * (not mode["observable"]) + "observable" + ", fixed" * mode["fixed"],
          "largest": number(mode["largest_px"], 3),
          "v": f"{_micro(mode['v_max_mm'], 4)} {_two_errors(mode)}"}
         for frame in frames for i, mode in enumerate(frame["modes"], start=1)
     ]  # fmt: skip
-    return Card.tabular(ReportTable.of("amplitudes", rows), wide=len(frames) > 1)
+    return Card.tabular(ReportTable.of("amplitudes", rows), wide=True)
 
 
 def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
@@ -385,11 +394,11 @@ def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
         fixed = [names[frame["name"]] for frame in of if frame["modes"][i]["fixed"]]
         found = [{p["name"]: p for p in frame["modes"][i]["parameters"]} for frame in free]
         units = {name: p["unit"] for column in found for name, p in column.items()}
-        rows = [(name, unit, *(_measured(column.get(name)) for column in found))
+        rows = [(indexed(name), unit.replace("-", "–"), *(_measured(c.get(name)) for c in found))
                 for name, unit in units.items()]  # fmt: skip
         columns = ("", "unit", *(names[frame["name"]] for frame in free))
         anchor = "mode" if i == 0 else f"mode-{i + 1}"
-        table = ReportTable(f"Parameters of φ{i + 1}", columns, rows, anchor)
+        table = ReportTable(indexed(f"Parameters of φ{i + 1}"), columns, rows, anchor)
         families = dict.fromkeys(frame["modes"][i]["family"] for frame in free)
         caption = "± standard error by noise ± by model error." + (
             f" Fixed: {'; '.join(fixed)}." if fixed else "")  # fmt: skip
@@ -417,17 +426,17 @@ def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]
                 noise, model = wave["sd_noise"] or [None] * 2, wave["sd_model_error"] or [None] * 2
                 remark = ", fixed" * mode["fixed"] or ", not observable" * (not mode["observable"])
                 xi1, xi2 = (Measured(wave["xi"][c], _known(noise[c], model[c])) for c in (0, 1))
-                rows.append({"photograph": names[frame["name"]] if i == w == 1 else "",
-                             "wave": f"{w} of φ{i}{remark}", "xi1": xi1, "xi2": xi2})  # fmt: skip
+                rows.append({"photograph": names[frame["name"]] if i == w == 1 else "", "xi1": xi1,
+                             "xi2": xi2, "wave": indexed(f"φ{i}: {w}") + remark})  # fmt: skip
     words = text_of("photographs-waves")
-    return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=len(frames) > 1)
+    return Card.tabular(ReportTable.of("waves", rows), caption=words, wide=True)
 
 
 def _contour_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
     """Table of modes by speckle and by contours; differences in standard deviations."""
     rows: list[dict[str, Cell]] = [
         {**row, "photograph": names[frame["name"]] if k == 0 else "",
-         "what": f"{row['what']} of φ{row['mode']}",
+         "what": indexed(f"{row['what']} of φ{row['mode']}"),
          "speckle": Measured(row["speckle"], (row["speckle_sd"],)),
          "contours": Measured(row["contours"], (row["contours_sd"],)),
          "difference": number(row["difference_sd"], 2)}

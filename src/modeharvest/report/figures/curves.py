@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -143,7 +144,7 @@ def draw_density(spectrum: Spectrum, pattern: WavePattern, component: int, end: 
     The colours end at ``end`` [mm⁶], usually the pattern's density: larger densities on the axes
     are due to the specimen's edges. If ``end`` is 0, they end at the largest peak off the axes.
     """
-    drawn, axes = wave_plane(1.0, 0.5, (0.17, 0.165, 0.59, 0.70), 0.84)
+    drawn, axes = wave_plane(1.0, 0.5, (0.205, 0.187, 0.565, 0.673), 0.84)
     xi1, xi2, both = spectrum.window(1.0)
     if not end > 0 and pattern.largest is not None:
         end = pattern.largest.density
@@ -198,19 +199,20 @@ def draw_convergence(result: Result) -> Figure:
         axes.yaxis.set_minor_locator(NullLocator())  # they take half the drawing time
         plain_ticks(axes.yaxis)
     axes.set_xlim(0.5, max(1, len(history)) + 0.5)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     return drawn
 
 
 def curve(
-    x: str, y: str, size: tuple[float, float] = CURVE, *, below: float = 0.46
+    x: str, y: str, size: tuple[float, float] = CURVE, *, below: float = 0.46, left: float = 0.57
 ) -> tuple[Figure, Axes]:
-    """Make an empty figure of a ``size`` [in] for curves, with room ``below`` the axes [in]."""
+    """Make an empty figure of a ``size`` [in] for curves; room ``below`` and ``left`` [in]."""
     width, height = size
     drawn = style.figure(width, height)
-    box = (0.57 / width, below / height, 1.0 - 0.67 / width, 1.0 - (below + 0.2) / height)
+    box = (left / width, below / height, 1.0 - (left + 0.1) / width, 1.0 - (below + 0.2) / height)
     axes = drawn.add_axes(box)
-    axes.set(xlabel=x, ylabel=y)
+    axes.set_xlabel(x)
+    axes.set_ylabel(y, labelpad=2)
     axes.grid(color=MUTED, alpha=0.18, lw=0.6)
     axes.set_axisbelow(True)
     return drawn, axes
@@ -223,20 +225,25 @@ def legend_above(axes: Axes, columns: int = 4) -> None:
                            handlelength=1.6, columnspacing=1.2, borderaxespad=0.1)  # fmt: skip
         for text in made.get_texts():
             text.set_parse_math(False)  # names may hold dollars
+        further = (len(made.get_texts()) - 1) // columns  # rows of the legend
+        (x0, y0), (x1, y1) = axes.get_position().get_points()
+        drawn = cast(Figure, axes.figure)
+        axes.set_position((x0, y0, x1 - x0, y1 - y0 - 0.13 * further / drawn.get_figheight()))
 
 
 def plain_ticks(*axes: Axis) -> None:
     """Label logarithmic axes with 20 rather than 2 x 10^1, and powers of ten without mathtext."""
     for axis in axes:
         axis.set_major_formatter(FuncFormatter(_plain))
-        axis.set_minor_formatter(FuncFormatter(_plain))
+        axis.set_minor_formatter(FuncFormatter(partial(_plain, axis=axis)))
         axis.set_tick_params(which="minor", labelsize=7, labelcolor=INK)
 
 
-def _plain(value: float, _: object) -> str:
+def _plain(value: float, _: object, axis: Axis | None = None) -> str:
     mantissa, power = f"{value:.0e}".split("e")
+    low, high = axis.get_view_interval() if axis else (1.0, 1.0)
     if -3 <= int(power) <= 4:
-        return f"{value:g}" if mantissa in "1235" else ""
+        return f"{value:g}" if mantissa in ("1235" if high < 500.0 * low else "125") else ""
     return ten_to(int(power)) if mantissa == "1" else ""
 
 
@@ -289,7 +296,9 @@ def draw_waves(frames: Sequence[dict[str, Any]]) -> Figure:
     ``frames``: those of ``summary.json`` with modes. Error bars: two standard deviations, by noise
     or model error, whichever is larger. Filled markers: free and observable parameters.
     """
-    drawn, axes = curve("nominal strain [%]", "components of the wave vectors, |ξ| [1/l]")
+    drawn, axes = curve(
+        "nominal strain [%]", "components of the wave vectors, |ξ| [1/l]", left=0.74
+    )
     for number, (label, points) in enumerate(_components(frames).items()):
         strain, value, sd, free = np.array(points, dtype=np.float64).T
         colour, marker = style.COLOURS[number // 2 % len(style.COLOURS)], "o^"[number % 2]

@@ -214,7 +214,7 @@ def draw_lattice_spectrum(
 def _plane(half: float) -> tuple[Figure, Axes]:
     """Make empty axes for wave vectors within ± ``half`` [1/l]."""
     step = 0.5 if half < 1.6 else 1.0
-    return curves.wave_plane(half, step, (0.17, 0.205, 0.59, 0.67), 0.88)
+    return curves.wave_plane(half, step, (0.205, 0.205, 0.565, 0.642), 0.88)
 
 
 def _first_zone(reciprocal: FloatArray) -> FloatArray:

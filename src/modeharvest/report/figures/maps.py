@@ -184,12 +184,17 @@ def draw_image(
     """Draw an image with a transparent background.
 
     ``image``: (rows, cols) grey levels, 0 black to 1 white; ``material``: (rows, cols) True on
-    material, None for everywhere; ``grid``: their pixels. ``displacement``: (n, 2) of the mesh's
-    nodes [mm], for the boundary. ``scale``: of the grey levels, by default 0 to 1 of full scale.
+    material, None: all is drawn, with a golden boundary; ``grid``: their pixels. ``displacement``:
+    (n, 2) of the mesh's nodes [mm], for the boundary. ``scale``: of the grey levels,
+    by default 0 to 1 of full scale.
     """
     drawn, axes = empty_map(map_frame, unit=unit)
     show_grey(axes, map_frame, image, material, grid)
-    draw_edge(axes, map_frame.boundary.path(displacement))
+    boundary = map_frame.boundary.path(displacement)
+    draw_edge(axes, boundary)
+    if material is None:
+        style.draw_path(axes, boundary, fill=False, ec=style.GOLD, lw=0.7, rasterized=True,
+                        zorder=2)  # fmt: skip
     colour_bar(axes, scale or ColourScale(style.GREY, 0.0, 1.0, "full scale"))
     return drawn
 

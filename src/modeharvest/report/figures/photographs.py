@@ -129,10 +129,7 @@ def draw_deformed(state: PhotographState) -> Figure:
     moved = map_frame.moved_nodes(state.motion)
     image = grey_levels(state.frame.image, state.levels)
     scale = ColourScale(GREY, *state.levels, "levels")
-    drawn = maps.draw_image(map_frame, image, None, state.view.grid, moved, scale)
-    style.draw_path(drawn.axes[0], map_frame.boundary.path(moved), fill=False, ec=GOLD, lw=0.7,
-                    rasterized=True, zorder=2)  # fmt: skip
-    return drawn
+    return maps.draw_image(map_frame, image, None, state.view.grid, moved, scale)
 
 
 def draw_closeup(state: PhotographState) -> Figure:

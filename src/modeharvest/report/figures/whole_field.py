@@ -15,7 +15,7 @@ from modeharvest.report.figures import fits
 from modeharvest.report.figures.fits import UM, Panel, S
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
 from modeharvest.report.model.content import Card, ReportTable
-from modeharvest.report.model.text import Cell, text_of
+from modeharvest.report.model.text import Cell, indexed, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import headings
 from modeharvest.validation.truth import lengths
@@ -130,10 +130,10 @@ def _mode_rows(numbers: Sequence[Numbers]) -> Iterable[tuple[Cell, ...]]:
             n["modes"][i] if i < len(n["modes"]) else {"parameters": ()} for n in numbers
         ]
         largest = [m.get(key) for m in modes for key in ("v_max_mm", "", "correlated_v_max_mm")]
-        yield (f"largest |v{i + 1}|", "mm", *largest)
+        yield (indexed(f"largest |v{i + 1}|"), "mm", *largest)
         found = [{p["name"]: p for p in mode["parameters"]} for mode in modes]
         units = {name: p["unit"] for column in found for name, p in column.items()}
         for name, unit in units.items():
             ways = (column.get(name, {}) for column in found)
             values = [p.get(key) for p in ways for key in ("refitted", "deviation", "correlated")]
-            yield (f"{name} of φ{i + 1}", unit, *values)
+            yield (indexed(f"{name} of φ{i + 1}"), unit.replace("-", "–"), *values)

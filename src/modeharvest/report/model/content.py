@@ -115,7 +115,7 @@ class ReportTable:
 
     @property
     def numeric(self) -> list[bool]:
-        """Whether each column has only numbers, or texts that begin with a digit; not the first."""
+        """Whether columns have only numbers, or texts that begin like them; not the first one."""
         others = [all(map(_is_number, column)) for column in zip(*self.rows, strict=True)][1:]
         return [False, *others]
 
@@ -198,7 +198,7 @@ class Report:
     """Figure at the top of the page, and its caption."""
     brief: ReportTable | None = None
     """Table that is printed on the terminal only."""
-    explore: Callable[[], str] | None = None
+    explore: Callable[[float], str] | None = None
     """Makes the HTML of the interactive display of fields, when the page is written."""
 
     @property
@@ -290,4 +290,5 @@ def _study_notes(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _is_number(cell: Cell) -> bool:
-    return not isinstance(cell, Mark) and (not isinstance(cell, str) or cell[:1].isdigit())
+    text = cell.lstrip("+-−").replace("–", "0", 1) if isinstance(cell, str) else "0"
+    return not isinstance(cell, Mark) and text[:1].isdigit()

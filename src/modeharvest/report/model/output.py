@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from modeharvest.report.model.content import Report, ReportFigure, ReportTable
-from modeharvest.report.model.text import Cell, Mark, Measured, fixed, number, together
+from modeharvest.report.model.text import Cell, Mark, Measured, fixed, number, typeset
 from modeharvest.util.files import atomic, write_csv
 from modeharvest.util.progress import Progress, counted, silent
 
 if TYPE_CHECKING:
     import jinja2
+
+MOST_BYTES = 7_900_000
+"""Bytes of a page's pictures and interactive display, if the latter can be made that small."""
 
 
 def draw_figures(figures: Iterable[ReportFigure], progress: Progress = silent) -> dict[str, str]:
@@ -42,8 +46,21 @@ def write_page(
     """
     if pictures is None:
         pictures = draw_figures(report.figures, progress)
+    explored = _explored(report, MOST_BYTES - sum(map(len, pictures.values())))
+    page = page_template().render(report=report, pictures=pictures, explored=explored)
     with atomic(path) as temporary:
-        temporary.write_text(page_template().render(report=report, pictures=pictures), "utf-8")
+        temporary.write_text(page, "utf-8")
+
+
+def _explored(report: Report, most: int) -> str:
+    """The interactive display, at most twice as coarse as it may be to have ``most`` bytes."""
+    if report.explore is None:
+        return ""
+    finest = report.explore(1.0)
+    if not 0.25 * len(finest) < most < len(finest):  # small enough, or never so
+        return finest
+    others = map(report.explore, (1.25, 1.5, 1.75, 2.0))
+    return next((text for text in others if len(text) <= most), finest)
 
 
 @cache
@@ -55,7 +72,9 @@ def page_template(name: str = "page.html") -> jinja2.Template:
         loader=jinja2.FileSystemLoader(str(resources.files("modeharvest.report"))), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"number": number, "fixed": fixed, "together": together}
+    environment.filters |= {"number": number, "fixed": fixed, "typeset": typeset}
+    shown = partial(json.dumps, indent=2, sort_keys=True, ensure_ascii=False)
+    environment.filters["json"] = shown  # tojson writes an apostrophe as \\u0027
     environment.tests |= {
         "mark": lambda cell: isinstance(cell, Mark),
         "measured": lambda cell: isinstance(cell, Measured),

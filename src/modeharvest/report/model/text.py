@@ -17,6 +17,9 @@ from markupsafe import Markup
 from modeharvest.fem.materials import Ogden
 
 NBSP = "\N{NO-BREAK SPACE}"
+_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]\d+)?")
+_JOINED = r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) |(?<=\d) (?=l\b|· 10)|(?<=\d ·) (?=10)"
+_INDICES = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 @cache
@@ -105,7 +108,7 @@ def number(value: Any, digits: int | None = None) -> str:
     if isinstance(value, Mark):
         return value.text
     if not isinstance(value, (int, float)) or isinstance(value, bool):
-        return str(value)
+        return typeset(str(value)) if _NUMBER.fullmatch(str(value)) else str(value)
     if not isfinite(value):
         return "∞" if value > 0 else "–"
     if digits is not None:
@@ -151,6 +154,23 @@ def _plain_number(value: Any) -> str:
     return ", ".join(f"{v:g}" for v in value) if isinstance(value, list | tuple) else f"{value:g}"
 
 
-def together(text: str) -> str:
-    """Replace spaces between a number and its unit or error by no-break spaces."""
-    return type(text)(re.sub(r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) ", NBSP, text))
+def typeset(text: str) -> str:
+    """Text as it is printed: minus signs, powers of ten, indices of v and φ, no-break spaces."""
+    new = re.sub(r"(?<![\w.])(\d[\d.]*)e([+-]?\d+)\b", _power, text)
+    new = re.sub(r"(?<![\w./-])(v|phi|φ)(\d)(?![\w/]|\.\w)", _symbol, new)
+    new = re.sub(r"(?<=\d) x (?=\d)", f"{NBSP}×{NBSP}", new)
+    new = re.sub(r"(?<![\w.)/-])-(?=\d)", "−", new)
+    return type(text)(re.sub(_JOINED, NBSP, new))
+
+
+def indexed(name: str) -> str:
+    """A parameter's name with its number as an index: "a₁" for "a1"."""
+    return re.sub(r"\b(\w)(\d+)\b", _symbol, name)
+
+
+def _power(found: re.Match[str]) -> str:
+    return f"{found[1]} · {ten_to(int(found[2]))}".removeprefix("1 · ")
+
+
+def _symbol(found: re.Match[str]) -> str:
+    return found[1].replace("phi", "φ") + found[2].translate(_INDICES)

@@ -138,9 +138,9 @@ def leaderboard(
     cells = [[f"{n}. {r['code']}", r["counted"], r["rms_px"],
               *(r["cases"].get(c, {}).get("rms_px") for c in known["cases"])]
              for n, r in enumerate(rows, 1)]  # fmt: skip
-    what = [[name, case["what"], case["nominal_strain"]] for name, case in known["cases"].items()]
+    what = [[n, c["what"], 100 * c["nominal_strain"]] for n, c in known["cases"].items()]
     board_table = ReportTable("Rms error per component [px]", columns, cells, "board")
-    about = ReportTable("Cases", ["case", "what it is", "nominal strain"], what, "cases")
+    about = ReportTable("Cases", ["case", "what it is", "nominal strain [%]"], what, "cases")
     cards = [card for t in (board_table, about) for card in Card.tabular(t, wide=True)]
     pages = {f"{name}/report.html": case["what"] for name, case in known["cases"].items()}
     graded = {name: what for name, what in pages.items() if (out / name).is_file()}

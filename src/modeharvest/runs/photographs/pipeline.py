@@ -401,7 +401,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
             mask=pair.deformed_mask, result=result,
-            identifiability=identifiability(result, pair.mask), residual_test=test, error_x=x,
+            identifiability=identifiability(result, geometry.mask), residual_test=test, error_x=x,
             error_y=y, by_noise=by_noise, by_model_error=by_model_error,
             spectrum=spectrum, pattern=pattern,
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()), w=w,
