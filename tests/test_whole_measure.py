@@ -318,6 +318,17 @@ def test_a_surface_that_has_changed_is_reported_and_spoils_nothing_else() -> Non
     assert np.sqrt(np.mean(error_px(pair, found)[far] ** 2)) < 0.05
 
 
+def test_an_island_whose_surface_has_changed_leaves_the_other_one_alone() -> None:
+    pair, at = plate_pair(wavy_field), np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
+    x, far = at[..., 0], at[..., 0] < -0.15
+    parts = [mask & (np.abs(x + 0.05) > 0.1) for mask in pair.masks]
+    other = np.where(far, pair.deformed, speckle(3)(x, at[..., 1]))
+    halves = replace(pair, deformed=other, mask=parts[0], deformed_mask=parts[1])
+    found = measure_displacement(halves, at_rest, options=COARSE)
+    assert "the images don't match" in found.warnings[-1]
+    assert np.sqrt(np.mean(error_px(halves, found)[far[parts[0]]] ** 2)) < 0.05
+
+
 def test_options_are_checked() -> None:
     for wrong in ({"element_px": 1.0}, {"steps": 0}, {"cutoff_px": 0.0}, {"edge_px": -1}):
         with pytest.raises(InputError):
