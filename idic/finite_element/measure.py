@@ -319,12 +319,13 @@ class _Measurement:
         grey, sums = self._prepare(FULL).pixels.grey, (at or self.linearised()).sums
         chance = sums.weights + _BY_CHANCE * np.sqrt(2.0 * sums.weights)
         found = sums.squares > _UNLIKE * float(grey.var()) * sums.weights + sum(self.noise) * chance
-        return np.asarray(found & (sums.counts[found].sum() > _SOME_PIXELS))
+        return np.asarray(found)
 
     def again_where_unlike(self, *stages: _Stage) -> None:
         """Measure again from the displacement around where images don't match, while that helps."""
         body, wave = self.body, _AROUND_PX * self.pair.grid.pixel_size
-        while (unlike := self.unlike()).any():
+        pixels = np.diff(self._prepare(FULL).pixels.start)
+        while pixels[unlike := self.unlike()].sum() > _SOME_PIXELS:
             known, last = body.away_from(unlike, _AROUND)[:, None], (self.u, self.prior)
             start, u = (
                 np.where(known, nodal, body.smoothed(nodal, wave, known[:, 0]))
@@ -456,7 +457,7 @@ class _Measurement:
                 "there the displacement is the smoothest that fits around, and its standard "
                 "deviation a guess.",
             )
-        if (unlike := self.unlike(at)).any():
+        if counts[unlike := self.unlike(at)].sum() > _SOME_PIXELS:
             worst = np.argmax(at.sums.squares / np.maximum(at.sums.weights, 1.0))
             row, col = self.pair.grid.to_px(*body.mesh.nodes[body.mesh.cells[worst]].mean(axis=0))
             self.warnings += (
