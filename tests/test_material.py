@@ -107,6 +107,17 @@ def test_holes_that_a_window_hardly_fits_into_are_found() -> None:
     assert (found != truth).mean() < 0.004  # one px along all edges would be 0.03
 
 
+def test_flat_patches_of_coarse_speckles_are_material() -> None:
+    row, col = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    truth = (abs(row - 209.3) < 185.0) & (abs(col - 230.7) < 200.0)
+    truth &= np.hypot((row + 20.0) % 45.0 - 22.5, (col + 10.0) % 45.0 - 22.5) > 16.5
+    for seed in (0, 4, 9):  # speckles of 12 px in windows of 9 px; the last has a wide bright one
+        speckle = 0.25 + 0.7 * Speckle(SpeckleSpec(seed=seed), SHAPE).image()
+        grey = np.where(truth, speckle, 0.08)
+        grey += 0.008 * np.random.default_rng(seed).normal(size=SHAPE)
+        assert (find_material(grey, 9).mask == truth).all()
+
+
 def test_without_a_background_all_is_material_and_that_is_reported() -> None:
     material = find_material(image(0.0, 0.01, np.ones(SHAPE, dtype=bool)))
     assert material.mask.all()

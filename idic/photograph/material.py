@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import gaussian_filter, label, mean, uniform_filter
 from skimage.filters import threshold_otsu
 
 from modeharvest.util.arrays import BoolArray, FloatImage
@@ -126,6 +126,7 @@ def _surely_background(contrast: FloatImage, window: int) -> tuple[BoolArray, fl
 
 def _refined(grey: FloatImage, sure: BoolArray, window: int) -> tuple[BoolArray, float]:
     """(material, share of it that looks like background), from the background's own level."""
+    sure = _without_speckle(grey, sure, window)
     level, spread = _background_level(grey, sure, 4 * window)
     away = np.abs(grey - level)
     tolerance = np.maximum(_SIGMAS * spread, _FAINTEST * float(np.ptp(grey)))
@@ -140,6 +141,22 @@ def _refined(grey: FloatImage, sure: BoolArray, window: int) -> tuple[BoolArray,
     background = _background(away < np.maximum(tolerance, half), sure, _REACH * window)
     share = float((away < tolerance)[some][inside].mean())
     return large_parts(~background, window**2 + 1), share
+
+
+def _without_speckle(grey: FloatImage, sure: BoolArray, window: int) -> BoolArray:
+    """What is surely background, without small patches whose level is that of flat speckles.
+
+    Between coarse speckles there are patches as dull as background. They are known by their level,
+    which is farther from the background's nearby than the speckle's standard deviation.
+    """
+    parts, _ = label(sure)
+    small = np.flatnonzero(np.bincount(parts.ravel()) <= window**2)
+    if small.size == 0 or sure.all():
+        return sure
+    away = grey - _background_level(grey, sure, 4 * window)[0]
+    off = np.abs(mean(away, parts, small)) > float(grey[~sure].std())
+    kept = sure & ~np.isin(parts, small[off])
+    return kept if kept.any() else sure
 
 
 def _background(alike: BoolArray, sure: BoolArray, reach: float) -> BoolArray:
