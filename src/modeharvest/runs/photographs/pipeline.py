@@ -88,7 +88,7 @@ from modeharvest.util.files import require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import picked, to_plain
-from modeharvest.validation.onset import find_buckling, mean_strain
+from modeharvest.validation.onset import find_buckling, load_axis, mean_strain
 
 _EDGE_PX = 2
 """A camera's pixels on an edge show some background, which removing distortion mixes further."""
@@ -193,6 +193,10 @@ class HarvestRun(StagedRun[PhotographCase]):
             numbers.append(frame_numbers(replace(known, timeline=moments[-1:]), frame))
             if len(results) <= MOST_SHOWN:  # more might not fit into memory
                 kept[name] = frame
+        keys = "strain_x", "strain_y"
+        along = keys[load_axis(np.array([[row[key] for key in keys] for row in numbers]))]
+        numbers = [{**row, "strain": row[along]} for row in numbers]
+        moments = [replace(m, strain=row[along]) for m, row in zip(moments, numbers, strict=True)]
         shown = [moments[k].name for k in shown_moments(moments)]
         frames = (kept.get(name) or self._frame(name, results[name]) for name in shown)
         return replace(
