@@ -57,9 +57,10 @@ _DENSER = 5, 16
 """
 _SMOOTH_PX = 60.0
 """Shorter waves of an initial guess come from motions in whole pixels, and would remain."""
-_FEW, _MANY = 1.3, 4.0
+_FEW, _MANY, _SOME = 0.75, 4.0, 2.0
 """Ratio of cut-off to shortest wave of the initial guess from which on a smoother one is tried, and
-over how many cut-offs that one is smoothed, unless the images then require a shorter cut-off."""
+over how many cut-offs that one is smoothed; over how many if the images then require a shorter
+cut-off (over one, errors of smooth waves are 1.4 times their standard deviation)."""
 _STRAY = 8.0
 """Largest difference of a block's motion from its neighbours' median, over their spread."""
 _FIRST = FiniteElementOptions(edge_px=4)
@@ -116,7 +117,7 @@ def displacement_from(
     smoother = measured(pair_alike, body.smoothed(start, _MANY * wave))
     if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
         return smoother
-    return measured(pair_alike, body.smoothed(start, wave))
+    return measured(pair_alike, body.smoothed(start, _SOME * wave))
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:
