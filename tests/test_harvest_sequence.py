@@ -105,3 +105,19 @@ def test_a_test_along_y_has_the_strain_along_y(photographs: Path, tmp_path: Path
     assert [row["strain"] for row in found.numbers] == [m.strain for m in found.timeline]
     assert found.buckling is not None
     assert (found.buckling.before, found.buckling.after) == pytest.approx((0.04, 0.06), abs=5e-4)
+
+
+def test_what_has_left_the_image_is_no_part_of_the_pattern(tmp_path: Path) -> None:
+    def moved(points: np.ndarray) -> np.ndarray:
+        return truth(0.06)(points) + np.array([80.0 * PIXEL, 0.0])
+
+    shown = photographed()
+    shown.save(tmp_path, {"frame_1": moved})
+    text = experiment("total").replace("v_degree = 1", "v_degree = 4")
+    (tmp_path / "moved.toml").write_text(text)
+    found = HarvestRun(PhotographCase.read(tmp_path / "moved.toml"), tmp_path / "out").harvest()
+    (row,), (moment,) = found.numbers, found.timeline
+    assert "of the material has left the image" in row["warnings"][0]
+    pattern = truth(0.06)(shown.points) - truth(CRITICAL)(shown.points) * 0.06 / CRITICAL
+    rms = np.sqrt(np.mean(pattern[shown.mask] ** 2)) / PIXEL
+    assert moment.amplitude_px == pytest.approx(rms, rel=0.01)  # extrapolated, it is 3 % off

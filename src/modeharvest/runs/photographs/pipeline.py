@@ -78,6 +78,7 @@ from modeharvest.runs.photographs.results import (
     error_fields,
     frame_numbers,
     harvest_summary,
+    in_view,
     shown_moments,
 )
 from modeharvest.runs.photographs.sequence import named_files
@@ -96,6 +97,11 @@ _ALONG = 120
 """Number of points of error bars along the longer side; they are as smooth as the ansatz."""
 _BOTH = "", "_speckle"
 """Suffixes of the file names of results by contours, and by speckle for comparison."""
+_MUCH = 0.01
+_LEFT = (
+    "{:.0f} % of the material has left the image: there v0 and v1 are extrapolated, with larger "
+    "errors than their error bars say; the numbers of the pattern are those of the rest"
+)
 
 
 @dataclass(frozen=True)
@@ -402,16 +408,20 @@ class HarvestRun(StagedRun[PhotographCase]):
         if case.whole_field.measure or self._plain is not None or case.local.code != "none":
             w = known.less(partial(result.ansatz.displacement_at, result.unknowns))
             own["w"] = measured_spectrum(w, cell, box)
+        out = result.outside_image / max(1, result.pixels + result.outside_image)
+        left = (_LEFT.format(100 * out),) * (out > _MUCH)
+        seen = pair.masks[0] & in_view(result, pair.grid.x, pair.grid.y) if left else pair.mask
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
             mask=pair.deformed_mask, result=result,
-            identifiability=identifiability(result, pair.mask), residual_test=test, error_x=x,
+            identifiability=identifiability(result, seen), residual_test=test, error_x=x,
             error_y=y, by_noise=by_noise, by_model_error=by_model_error,
             spectrum=spectrum, pattern=pattern,
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()), w=w,
             whole=measured.whole, contours=beside.get(name), rigid=self.prepared.rigid.get(name),
             start_text=tuple(s for s in measured.text if s not in pattern.text),
-            warnings=(*found.warnings, *measured.warnings, *([why[name]] if name in why else ())),
+            warnings=(*left, *found.warnings, *measured.warnings,
+                      *([why[name]] if name in why else ())),
         )  # fmt: skip
 
     def _errors(self, name: str, measured: MeasuredPhotograph) -> Covariance:
