@@ -32,7 +32,7 @@ from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field
-from modeharvest.idic.photograph.displacement import block_motion, displacement_from
+from modeharvest.idic.photograph.displacement import block_motion, displacement_from, uneven_light
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import write_image
@@ -300,6 +300,15 @@ def test_what_does_not_match_is_reported(plate: Plate, tmp_path: Path) -> None:
     summary = measure(plate.folder / "ref.tif", [tmp_path / "patched.tif"], tmp_path / "out",
                       mask=plate.folder / "mask.tif")  # fmt: skip
     assert "the images don't match" in summary["images"][0]["warnings"][-1]
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.01, 0), (0.03, 1)])
+def test_light_that_changes_along_the_material_is_reported(share: float, count: int) -> None:
+    pair, _ = plate_and_body()
+    light = np.linspace(1.0 - share, 1.0 + share, GRID.cols)  # beside the material, too
+    assert pair.truth is not None
+    lit = pair.with_images(pair.reference, light * pair.deformed)
+    assert len(uneven_light(lit, pair.truth.displacement)) == count
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
