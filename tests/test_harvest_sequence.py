@@ -121,3 +121,15 @@ def test_what_has_left_the_image_is_no_part_of_the_pattern(tmp_path: Path) -> No
     pattern = truth(0.06)(shown.points) - truth(CRITICAL)(shown.points) * 0.06 / CRITICAL
     rms = np.sqrt(np.mean(pattern[shown.mask] ** 2)) / PIXEL
     assert moment.amplitude_px == pytest.approx(rms, rel=0.01)  # extrapolated, it is 3 % off
+
+
+def test_light_that_changes_along_the_material_is_reported(tmp_path: Path) -> None:
+    shown = photographed()
+    shown.save(tmp_path, {"frame_1": truth(0.03)})
+    light, frame = np.linspace(0.93, 1.0, shown.grid.cols), tmp_path / "frame_1.tif"
+    tifffile.imwrite(frame, np.uint8(light * tifffile.imread(frame)))
+    for name, more, count in (("without", "", 1), ("with", "gain_degree = 1\n", 0)):
+        (tmp_path / f"{name}.toml").write_text(experiment("total") + more)
+        case = PhotographCase.read(tmp_path / f"{name}.toml")
+        (row,) = HarvestRun(case, tmp_path / name).harvest().numbers
+        assert sum("light changed" in text for text in row["warnings"]) == count

@@ -271,7 +271,7 @@ def uneven_light(pair: ImagePair, u: FloatArray) -> tuple[str, ...]:
     change = float(np.ptp(level) / abs(level.mean()))
     text = (
         f"The light changed along the material, by {100 * change:.0f} %, which is taken for "
-        "displacement: measure with brightness 1 or 2 (--brightness)."
+        "displacement: measure with --brightness 1 or 2, harvest with gain_degree 1 or 2."
     )
     return (text,) * (change > _UNEVEN)
 

@@ -33,6 +33,7 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field, write_field
+from modeharvest.idic.photograph.displacement import uneven_light
 from modeharvest.idic.photograph.gauges import points_of, reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
@@ -410,6 +411,8 @@ class HarvestRun(StagedRun[PhotographCase]):
             own["w"] = measured_spectrum(w, cell, box)
         out = result.outside_image / max(1, result.pixels + result.outside_image)
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
+        if self._plain is None and out < 0.5 and not case.correlation.brightness.size:
+            left += uneven_light(pair, result.displacement())
         seen = pair.masks[0] & in_view(result, pair.grid.x, pair.grid.y) if left else pair.mask
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
