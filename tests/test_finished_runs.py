@@ -14,7 +14,7 @@ from scipy.io import loadmat
 from test_cli import called, error_line
 from test_gauges import GRID, MESH, affine, result
 
-from modeharvest.idic.finite_element.files import Given, write_result
+from modeharvest.idic.finite_element.files import Given, write_csv, write_result
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.photograph.finished import FinishedRun
 from modeharvest.imaging.photographs.files import write_image
@@ -92,9 +92,12 @@ def test_lengths_in_pixels_stay_so(tmp_path: Path) -> None:
     grid = replace(GRID, pixel_size=1.0, x0=-60.0, y0=40.0)
     in_px = replace(result(affine(STRETCH)), grid=grid)
     write_result(tmp_path / "a.h5", in_px, Given("px"))
-    field = read_field(tmp_path / "a.h5", grid)
-    np.testing.assert_allclose(np.column_stack([field.x, field.y]), MESH.nodes, atol=1e-9)
-    np.testing.assert_allclose(field.u, affine(STRETCH), atol=1e-9)
+    write_csv(tmp_path / "a.csv", in_px, given=Given("px"))
+    for name in ("a.h5", "a.csv"):
+        field = read_field(tmp_path / name, grid)
+        np.testing.assert_allclose(np.column_stack([field.x, field.y]), MESH.nodes, atol=1e-6)
+        np.testing.assert_allclose(field.u, affine(STRETCH), atol=1e-8)
+        assert field.convention == "modeharvest: in px, y down, first pixel 0"
     with pytest.raises(InputError, match="expected the size of a pixel for gom"):
         FinishedRun.read(tmp_path / "a.h5").export("gom", tmp_path / "out", 3)
 

@@ -86,6 +86,25 @@ def test_three_waves_of_a_hexagonal_lattice_are_three_modes(tmp_path: Path) -> N
     assert error_px(measured, photographed, of(ansatz, a)) < 0.03
 
 
+def test_the_square_pattern_of_a_turned_lattice_has_free_waves(tmp_path: Path) -> None:
+    """Its two waves displace along directions of their own, not along x and y in one ratio."""
+    c, s = np.cos(np.radians(4.0)), np.sin(np.radians(4.0))
+    vectors = PITCH * np.array([[c, s], [-s, c]])
+    cellular, domain = (Box.centred(6 * PITCH + d, 6 * PITCH + d) for d in (0.0, 1.6))
+    ks = [[c - s, s + c], [-c - s, -s + c]]
+    mode = free_family([[-k[1], k[0], *k, 0.0] for k in ks])
+    ansatz = Ansatz(domain, (FourierMode.scaled(mode, PITCH, Taper(cellular, PITCH / 2)),), 3, 0)
+    a = ansatz.initial_guess(0.05)
+    a[ansatz.v_slice(0)] = 3.0
+    holes = lattice_points(vectors, Box.centred(5.5 * PITCH, 5.5 * PITCH), (0.0, 0.0))
+    photographed = Photographed(PixelGrid.centred(330, 330, PIXEL), domain, holes, 1.4)
+    photographed.save(tmp_path, {"frame": of(ansatz, a)})
+    run = harvesting(tmp_path, f"polygon = {corners(cellular, photographed.grid)}")
+    (measured,) = run.results().values()
+    assert measured.result.ansatz.modes[0].family.name != "square"
+    assert error_px(measured, photographed, of(ansatz, a)) < 0.03
+
+
 def two_patterns() -> tuple[Photographed, Displacement, tuple[Box, Box]]:
     """Square pattern above; below, rows of holes that shear alternately."""
     cellular, domain = Box.centred(6 * PITCH, 8 * PITCH), Box.centred(6 * PITCH + 1.6, 17.0)

@@ -36,6 +36,14 @@ def truth(strain: float) -> Displacement:
     return of(ansatz, ansatz.initial_guess(strain, 20.0 * np.sqrt(max(0.0, strain - CRITICAL))))
 
 
+def experiment(formulation: str) -> str:
+    return (
+        '[images]\nreference = "reference.tif"\ndeformed = ["frame*.tif"]\n'
+        f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = {PITCH}\n"
+        f'[correlation]\nv0_degree = 2\nv_degree = 1\nformulation = "{formulation}"\n'
+    )
+
+
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five states, and a photograph of another specimen between the third and the fourth."""
@@ -51,11 +59,7 @@ def harvesting(
 ) -> HarvestRun:
     """In both formulations."""
     path = photographs / f"{request.param}.toml"
-    path.write_text(
-        '[images]\nreference = "reference.tif"\ndeformed = ["frame*.tif"]\n'
-        f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = {PITCH}\n"
-        f'[correlation]\nv0_degree = 2\nv_degree = 1\nformulation = "{request.param}"\n'
-    )
+    path.write_text(experiment(request.param))
     folder = tmp_path_factory.mktemp(request.param)
     return HarvestRun(PhotographCase.read(path), folder)
 
@@ -90,3 +94,42 @@ def test_each_goes_on_from_the_one_before(harvesting: HarvestRun) -> None:
                for m in results]  # fmt: skip
     # The second has a held mode as the first; the third shows a pattern that the second has not.
     assert goes_on == [False, True, False, True, True]
+
+
+def test_a_test_along_y_has_the_strain_along_y(photographs: Path, tmp_path: Path) -> None:
+    for name in ("reference", "frame_400", "frame_600"):
+        tifffile.imwrite(tmp_path / f"{name}.tif", tifffile.imread(photographs / f"{name}.tif").T)
+    (tmp_path / "total.toml").write_text(experiment("total"))
+    found = HarvestRun(PhotographCase.read(tmp_path / "total.toml"), tmp_path / "out").harvest()
+    assert [moment.strain for moment in found.timeline] == pytest.approx([0.04, 0.06], abs=5e-4)
+    assert [row["strain"] for row in found.numbers] == [m.strain for m in found.timeline]
+    assert found.buckling is not None
+    assert (found.buckling.before, found.buckling.after) == pytest.approx((0.04, 0.06), abs=5e-4)
+
+
+def test_what_has_left_the_image_is_no_part_of_the_pattern(tmp_path: Path) -> None:
+    def moved(points: np.ndarray) -> np.ndarray:
+        return truth(0.06)(points) + np.array([80.0 * PIXEL, 0.0])
+
+    shown = photographed()
+    shown.save(tmp_path, {"frame_1": moved})
+    text = experiment("total").replace("v_degree = 1", "v_degree = 4")
+    (tmp_path / "moved.toml").write_text(text)
+    found = HarvestRun(PhotographCase.read(tmp_path / "moved.toml"), tmp_path / "out").harvest()
+    (row,), (moment,) = found.numbers, found.timeline
+    assert "of the material has left the image" in row["warnings"][0]
+    pattern = truth(0.06)(shown.points) - truth(CRITICAL)(shown.points) * 0.06 / CRITICAL
+    rms = np.sqrt(np.mean(pattern[shown.mask] ** 2)) / PIXEL
+    assert moment.amplitude_px == pytest.approx(rms, rel=0.01)  # extrapolated, it is 3 % off
+
+
+def test_light_that_changes_along_the_material_is_reported(tmp_path: Path) -> None:
+    shown = photographed()
+    shown.save(tmp_path, {"frame_1": truth(0.03)})
+    light, frame = np.linspace(0.93, 1.0, shown.grid.cols), tmp_path / "frame_1.tif"
+    tifffile.imwrite(frame, np.uint8(light * tifffile.imread(frame)))
+    for name, more, count in (("without", "", 1), ("with", "gain_degree = 1\n", 0)):
+        (tmp_path / f"{name}.toml").write_text(experiment("total") + more)
+        case = PhotographCase.read(tmp_path / f"{name}.toml")
+        (row,) = HarvestRun(case, tmp_path / name).harvest().numbers
+        assert sum("light changed" in text for text in row["warnings"]) == count

@@ -17,7 +17,7 @@ from modeharvest.idic.photograph.holes import (
     find_holes,
     lattice_of,
 )
-from modeharvest.idic.photograph.matching.holes import possible_motions
+from modeharvest.idic.photograph.matching.holes import possible_motions, rigid_motion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.errors import InputError
 
@@ -210,6 +210,16 @@ def test_rivals_are_reported_when_a_column_left_the_image() -> None:
     np.testing.assert_allclose(motions[0].after - motions[0].before, [[0.0, -30.0]] * 50)
     np.testing.assert_allclose(motions[1].after - motions[1].before, [[0.0, 160.0]] * 50)
     assert "2 ways" in motions[0].text[1]
+
+
+@pytest.mark.parametrize("counts", [(2, 2), (2, 3), (3, 4), (4, 5), (8, 7)])
+def test_a_pattern_does_not_turn_the_specimen(counts: tuple[int, int]) -> None:
+    points = lattice_points(SQUARE, counts)
+    i, j = np.rint((points - points.min(axis=0)) / SQUARE.max()).T
+    states = np.array([[0.93, 0.0], [0.0, 1.02]]), np.outer((-1.0) ** (i + j), (3.0, -5.0))
+    after = (points @ states[0] + states[1]) @ turned(7.0) + 20.0
+    motion = rigid_motion(lattice_of(holes_at(points)), lattice_of(holes_at(after)))
+    assert motion.angle_deg == pytest.approx(7.0, abs=1e-9)
 
 
 def test_motion_in_mm_has_y_upwards() -> None:

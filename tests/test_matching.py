@@ -127,7 +127,7 @@ def test_motion_between_holes_reproduces_affine_maps() -> None:
     random = np.random.default_rng(0)
     before = random.uniform(0, 300, size=(20, 2))
     matrix, shift = np.array([[0.9, 0.05], [-0.02, 1.03]]), (12.0, -30.0)
-    motion = HoleMotion(before, before @ matrix + shift, 0, ())
+    motion = HoleMotion(before, before @ matrix + shift, np.zeros((20, 2), int), 0, ())
     np.testing.assert_allclose(motion.at(before), motion.after, atol=1e-9)
     points = random.uniform(-100, 400, size=(5, 2))
     np.testing.assert_allclose(motion.at(points), points @ matrix + shift, atol=1e-8)

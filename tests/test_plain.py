@@ -23,7 +23,7 @@ from modeharvest.idic.finite_element.contours.measure import (
     STEPS_PX3,
     displacement_from_contours,
 )
-from modeharvest.idic.finite_element.contours.penalised_body import straight_sides
+from modeharvest.idic.finite_element.contours.penalised_body import PenalisedBody, straight_sides
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.system import Body
@@ -459,6 +459,17 @@ def experiment(photographed: Path, tmp_path: Path) -> Path:
         f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = 1.9\n"
     )
     return path
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_contours_that_do_not_settle_are_no_converged_result(
+    experiment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settle = PenalisedBody.settle
+    monkeypatch.setattr(PenalisedBody, "settle", lambda *how: settle(*how) and False)
+    (frame,) = harvest(experiment, tmp_path / "out")["frames"]
+    assert "didn't converge" in frame["warnings"][0]
+    assert frame["outcome"] == "max_iterations"
 
 
 def test_harvest_finds_modes_by_contours(

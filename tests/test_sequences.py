@@ -77,6 +77,16 @@ def test_the_reference_is_not_among_the_deformed(tmp_path: Path) -> None:
         chosen_frames(tmp_path, "alone/f0.tif", ["alone"], how, log, out)
 
 
+def test_the_log_begins_with_the_reference_if_that_is_the_first(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("Time [s];Force [N]\n0;0\n90;9\n")
+    folder_of(tmp_path / "shots", [f"cam_2026-03-01_10-00-{s}" for s in ("00", "20", "50")])
+    reference, log = "shots/cam_2026-03-01_10-00-00.tif", LogTable("log.csv")
+    how = FrameChoice(), log, tmp_path / "out"
+    found = chosen_frames(tmp_path, reference, ["shots"], *how)
+    assert [known["time_s"] for known in found.recorded.values()] == pytest.approx([20.0, 50.0])
+    assert [known["force_N"] for known in found.recorded.values()] == pytest.approx([2.0, 5.0])
+
+
 def test_an_empty_folder_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "shots").mkdir()
     with pytest.raises(InputError, match="found none among its 0 entries"):
@@ -162,7 +172,9 @@ def test_frames_of_a_video(tmp_path: Path, kind: str) -> None:
     assert [path.stem for path in found.deformed] == ["test_000001", "test_000006", "test_000011"]
     levels = [np.asarray(Image.open(path)).mean() for path in (found.reference, *found.deformed)]
     assert levels == pytest.approx([20, 30, 80, 130], abs=2.0)
-    assert [known["time_s"] for known in found.recorded.values()] == pytest.approx([0, 1.25, 2.5])
+    assert [known["time_s"] for known in found.recorded.values()] == (
+        pytest.approx([0.25, 1.5, 2.75])  # the reference is the first
+    )
     stamps = [path.stat().st_mtime_ns for path in found.deformed]
     chosen_frames(tmp_path, f"test.{kind}", [f"test.{kind}"], FrameChoice(every=5), LogTable(),
                   tmp_path / "out")  # fmt: skip
@@ -323,7 +335,7 @@ def test_a_video_is_harvested_with_its_log(
     frames = summary["frames"]
     assert [frame["name"] for frame in frames] == ["test_000001", "test_000003"]
     assert [frame["strain"] for frame in frames] == pytest.approx([0.01, 0.03], abs=5e-4)
-    assert [frame["time_s"] for frame in frames] == [0.0, 1.0]
+    assert [frame["time_s"] for frame in frames] == [0.5, 1.5]
     assert [frame["force_N"] for frame in frames] == pytest.approx([5.0, 15.0])
     assert summary["experiment"]["images"]["deformed"] == ["test.avi"]
     assert "timeline-force" in (tmp_path / "out/report.html").read_text("utf-8")

@@ -12,7 +12,7 @@ from manufactured import GRID
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.validation.onset import ImageAmplitude, find_buckling, mean_strain
+from modeharvest.validation.onset import ImageAmplitude, find_buckling, load_axis, mean_strain
 
 CRITICAL = 0.091
 
@@ -47,6 +47,12 @@ def test_a_pattern_from_the_beginning_is_reported() -> None:
     found = find_buckling([moment(e) for e in (0.1, 0.12)])
     assert np.isnan(found.before)
     assert "Every image" in found.text
+
+
+@pytest.mark.parametrize("strains", [(0.1, -0.04), (0.1, -0.1), (0.1, 0.08), (-0.1, 0.04)])
+def test_the_axis_of_the_load_is_found(strains: tuple[float, float]) -> None:
+    test = np.outer([0.1, 1.0], strains)
+    assert (load_axis(test), load_axis(test[:, ::-1])) == (0, 1)
 
 
 def test_mean_strain_is_that_of_the_slow_field() -> None:

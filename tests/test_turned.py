@@ -65,7 +65,7 @@ def run(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> HarvestR
 def test_a_harvest_turns_the_specimen_back(run: HarvestRun, name: str) -> None:
     degrees, (right, up) = TURNS[name]
     rigid = run.prepared.rigid[name]
-    assert rigid.angle_deg == pytest.approx(degrees, abs=0.1)
+    assert rigid.angle_deg == pytest.approx(degrees, abs=0.02)
     moved = np.array(rigid.after) - rigid.before
     assert moved == pytest.approx([-up, right], abs=3.0)  # of the holes' mean, not of the origin
     result = run.results()[name].result

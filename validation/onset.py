@@ -10,6 +10,7 @@ import numpy as np
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import OBSERVABLE
+from modeharvest.util.arrays import FloatArray
 
 _FIT = 3
 """Least number of images with a pattern for the fit of a pitchfork."""
@@ -21,7 +22,7 @@ class ImageAmplitude:
 
     name: str
     strain: float
-    """Mean nominal compression of the cellular part, from v0 [-]."""
+    """Mean nominal compression of the cellular part along the load, from v0 [-]."""
     amplitude_px: float
     """Rms of v1 phi1; with several modes the root of the sum of their squares [px]."""
     model_error_px: float
@@ -68,6 +69,15 @@ def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
         for edge, u in zip(apart, moved, strict=True)
     )
     return float(along_x), float(along_y)
+
+
+def load_axis(strains: FloatArray) -> int:
+    """Axis of a test's load, 0 for x or 1 for y: that along which its images compress most.
+
+    ``strains`` (n, 2): compression of each image [-]. Tension counts half, because a compressed
+    specimen widens across its load.
+    """
+    return int(np.argmax(np.maximum(strains, -0.5 * strains).max(axis=0)))
 
 
 def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:

@@ -27,6 +27,8 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import open_hdf5
 
 _LENGTHS = {"px": "px", "pixel": "px", "mm": "mm"}  # in files of DaVis
+_CSV_PX = {"x": "column", "y": "row", "u": "u [px]", "v": "v up [px]", "sd_u": "sd_u [px]",
+           "sd_v": "sd_v [px]"}  # fmt: skip
 _DISPLACEMENTS, _INFO = "data_dic_save/displacements", "data_dic_save/dispinfo/"
 
 
@@ -165,6 +167,9 @@ def _cased(table: Table, *patterns: tuple[str, str]) -> Table | None:
 
 def _own(path: Path, table: Table, units: str | None, y_axis: str | None) -> Known:
     """Displacements that modeharvest measured at the nodes of a mesh."""
+    if set(_CSV_PX.values()) <= set(table):  # x and y [px] count from the middle of the image
+        own = {role: table[name] for role, name in _CSV_PX.items()}
+        return own | {"v": -own["v"]}, Convention("modeharvest", "px", "px", "down")
     if not {"nodes", "cells", "displacement", "standard_deviation"} <= set(table):
         return None
     with open_hdf5(path, "a measured displacement (HDF5)", "measure again") as file:

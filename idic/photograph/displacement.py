@@ -57,9 +57,10 @@ _DENSER = 5, 16
 """
 _SMOOTH_PX = 60.0
 """Shorter waves of an initial guess come from motions in whole pixels, and would remain."""
-_FEW, _MANY = 1.3, 4.0
+_FEW, _MANY, _SOME = 0.75, 4.0, 2.0
 """Ratio of cut-off to shortest wave of the initial guess from which on a smoother one is tried, and
-over how many cut-offs that one is smoothed, unless the images then require a shorter cut-off."""
+over how many cut-offs that one is smoothed; over how many if the images then require a shorter
+cut-off (over one, errors of smooth waves are 1.4 times their standard deviation)."""
 _STRAY = 8.0
 """Largest difference of a block's motion from its neighbours' median, over their spread."""
 _FIRST = FiniteElementOptions(edge_px=4)
@@ -75,6 +76,8 @@ _OFF_PX, _AT_EDGE_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0), 1.0
 the images match everywhere, or no better), and before the last measurement."""
 _UNLIKE, _ROUNDS = 4.5, 4
 """Residual over its median, 3 standard deviations of noise, beyond which pixels don't match."""
+_UNEVEN = 0.03
+"""Range of the light's relative change over the material from which on it is reported."""
 _SAMPLES, _LEAST = 100_000, 0.1
 """Pixels from which brightness is fitted; least gain anywhere, over the mean."""
 
@@ -116,7 +119,7 @@ def displacement_from(
     smoother = measured(pair_alike, body.smoothed(start, _MANY * wave))
     if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
         return smoother
-    return measured(pair_alike, body.smoothed(start, wave))
+    return measured(pair_alike, body.smoothed(start, _SOME * wave))
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:
@@ -260,6 +263,19 @@ def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
     return found
 
 
+def uneven_light(pair: ImagePair, u: FloatArray) -> tuple[str, ...]:
+    """Warn if the light changed differently over the material; ``u`` (rows, cols, 2) [mm]."""
+    mask, maps = pair.masks[0], brightness(pair, u, 1)
+    gain, offset = (part[mask] for part in maps)
+    level = (float(pair.reference[mask].mean()) - offset) / gain
+    change = float(np.ptp(level) / abs(level.mean()))
+    text = (
+        f"The light changed along the material, by {100 * change:.0f} %, which is taken for "
+        "displacement: measure with --brightness 1 or 2, harvest with gain_degree 1 or 2."
+    )
+    return (text,) * (change > _UNEVEN)
+
+
 def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple[str, ...]:
     """Warn if images don't match somewhere: the residual is above noise, and not slight.
 
@@ -270,7 +286,8 @@ def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple
     return (
         f"The residual of the whole displacement is {result.residual_rms:.3g} grey levels, of "
         f"which noise is about {noise:.2g}: somewhere the images don't match, see its map; give "
-        "images in between, or a mask without what is not material.",
+        "images in between, a mask without what is not material, or, where the light changed along "
+        "the material, a brightness that varies.",
     )
 
 

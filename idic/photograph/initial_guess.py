@@ -109,6 +109,8 @@ def initial_guess(
         families = modes_of(pattern, cells)
         modes += [(family, box) for family in families]
         text += pattern.text
+        if pattern.start is not None and cells.turned:
+            text.append("The lattice is turned and Eq. (6) can't be: its two waves are free.")
         if len(families) > 1:
             text.append(
                 f"The waves share no vector of the reciprocal lattice: {len(families)} modes, each "
@@ -134,6 +136,8 @@ def initial_guess(
     return InitialGuess(ansatz, fit.coefficients, patterns, local, tuple(text))
 
 
+_TURNED = 0.0175
+"""Tangent of the angle from which on a lattice is turned: a degree."""
 NEARLY_SQUARE = 0.05
 """Relative difference of lengths, and cosine between directions, up to which vectors are square."""
 WRONG_CELL = 0.07
@@ -188,6 +192,12 @@ class Cells:
         a, b = np.linalg.norm(self.vectors, axis=1)
         cosine = abs(self.vectors[0] @ self.vectors[1]) / (a * b)
         return bool(abs(a - b) <= NEARLY_SQUARE * a and cosine <= NEARLY_SQUARE)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the first lattice vector is a degree or more off the x axis."""
+        x, y = self.vectors[0]
+        return bool(abs(y) > _TURNED * abs(x))
 
 
 def hole_centres(pair: ImagePair, boxes: Sequence[Box], cell_size: float) -> FloatArray:
@@ -254,10 +264,12 @@ def require_cell_size(pattern: WavePattern, cell_size: float) -> None:
 def modes_of(pattern: WavePattern, cells: Cells) -> list[ModeFamily]:
     """Make the modes of a pattern: the paper's family for the square pattern, else free waves.
 
+    On a lattice that is turned against x and y the square pattern's two waves are free, too: they
+    displace along directions of their own, and Eq. (6) has one ratio a1 of x to y for both.
     Waves whose vectors differ by a reciprocal lattice vector are coupled by the holes and make one
     mode. Each group of such waves has its own mode, with its own amplitude v.
     """
-    if pattern.start is not None:
+    if pattern.start is not None and not cells.turned:
         return [replace(nearest_origin(pattern.start, cells.cell_size), name="square")]
     return [_free_mode(group) for group in grouped(pattern.waves, partial(_coupled, cells))]
 

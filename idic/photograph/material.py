@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import gaussian_filter, label, mean, uniform_filter
 from skimage.filters import threshold_otsu
 
 from modeharvest.util.arrays import BoolArray, FloatImage
@@ -39,9 +39,9 @@ _WIDE = 2.0
 however little of them was wide enough to lack contrast."""
 _SPECK_PX2 = 6
 """Area of what can be a few pixels' noise in the background."""
-_WALL_WINDOW, _WALL_SHARPNESS = 0.6, 0.3
-"""Window of sharpness over that of speckle; and share of the material's fine contrast below which a
-region is out of focus."""
+_WALL_WINDOW, _WALL_PX, _WALL_SHARPNESS = 0.6, 13, 0.3
+"""Window of sharpness over that of speckle; its least size, more than flat speckles have [px]; and
+share of the material's fine contrast below which a region is out of focus."""
 _SLIGHTEST = 0.02
 """Share of material with grey levels of the background from which on that is reported."""
 
@@ -126,6 +126,7 @@ def _surely_background(contrast: FloatImage, window: int) -> tuple[BoolArray, fl
 
 def _refined(grey: FloatImage, sure: BoolArray, window: int) -> tuple[BoolArray, float]:
     """(material, share of it that looks like background), from the background's own level."""
+    sure = _without_speckle(grey, sure, window)
     level, spread = _background_level(grey, sure, 4 * window)
     away = np.abs(grey - level)
     tolerance = np.maximum(_SIGMAS * spread, _FAINTEST * float(np.ptp(grey)))
@@ -142,6 +143,22 @@ def _refined(grey: FloatImage, sure: BoolArray, window: int) -> tuple[BoolArray,
     return large_parts(~background, window**2 + 1), share
 
 
+def _without_speckle(grey: FloatImage, sure: BoolArray, window: int) -> BoolArray:
+    """What is surely background, without small patches whose level is that of flat speckles.
+
+    Between coarse speckles there are patches as dull as background. They are known by their level,
+    which is off the background's nearby by more than a quarter of the speckle's deviation.
+    """
+    parts, _ = label(sure)
+    small = np.flatnonzero(np.bincount(parts.ravel()) <= window**2)
+    if small.size == 0 or sure.all():
+        return sure
+    away = grey - _background_level(grey, sure, 4 * window)[0]
+    off = np.abs(mean(away, parts, small)) > 0.25 * float(grey[~sure].std())
+    kept = sure & ~np.isin(parts, small[off])
+    return kept if kept.any() else sure
+
+
 def _background(alike: BoolArray, sure: BoolArray, reach: float) -> BoolArray:
     """Wide regions of the background's grey level, or connected to what is surely background."""
     wide = opened(~large_parts(~alike, _SPECK_PX2 + 1), reach)
@@ -153,7 +170,7 @@ def _without_walls(grey: FloatImage, material: BoolArray, window: int) -> tuple[
 
     Through a hole in a thick specimen the camera sees the hole's wall, bright but blurred.
     """
-    narrow = max(5, int(_WALL_WINDOW * window))
+    narrow = max(_WALL_PX, int(_WALL_WINDOW * window))
     fine = gaussian_filter(grey, 0.7) - gaussian_filter(grey, 2.7)
     power = uniform_filter(fine.astype(np.float64) ** 2, narrow)
     sharpness = np.sqrt(np.maximum(power, 0.0))

@@ -38,7 +38,7 @@ _SOFTER, _STIFFER = 7.0 / 3.0, 49.0
 _SPRINGS = (0.5, 5.0)
 """Stiffnesses of the springs, used one after the other [shear modulus/px]."""
 _TOLERANCE_PX, _PROBES, _TINY = 0.01, 4, 1e-200
-_ASTRAY = (
+UNSETTLED = (
     "The displacement from contours didn't converge: don't use it; give pictures in between, or of "
     "more pixels across notches and slits."
 )
@@ -98,7 +98,9 @@ def displacement_from_contours(
             state.noise = max(seen.noise, STEPS_PX3 * state.px**3)
         sd, known = _deviations(state, law is None, bool(sides) and not slides, is_stepped, left)
     except ArithmeticError as error:
-        raise InputError(f"expected contours that hold the body, got others: {_ASTRAY}") from error
+        raise InputError(
+            f"expected contours that hold the body, got others: {UNSETTLED}"
+        ) from error
     stepped = (_STEPPED.format(rms, by_noise),) if is_stepped else ()
     return NodalResult(
         mesh=mesh,
@@ -118,7 +120,7 @@ def displacement_from_contours(
         effective_unknowns=known,
         library="" if state.last_factor is None else state.last_factor.library,
         shown="contours",
-        warnings=stepped if converged else (_ASTRAY, *stepped),
+        warnings=stepped if converged else (UNSETTLED, *stepped),
     )
 
 

@@ -43,6 +43,8 @@ class HoleMotion:
     before: FloatArray
     after: FloatArray
     """(n, 2) centres in the reference and in the deformed image, (row, col) [px]."""
+    index: IntArray
+    """(n, 2) indices (i, j) in the reference's lattice."""
     rivals: int
     """Number of other alignments of the lattices that match as many holes."""
     text: tuple[str, ...]
@@ -115,14 +117,20 @@ class RigidMotion:
 def rigid_motion(reference: HoleLattice, deformed: HoleLattice) -> RigidMotion:
     """Rotation and translation of the holes as a whole, without strain and pattern.
 
-    The least-squares solution of G. Wahba's problem, for the likeliest match of the holes: below
-    some 25 degrees, and up to whole cells. InputError if they aren't the same specimen's.
+    The polar rotation of an affine motion, for the likeliest match of the holes: below some 25
+    degrees, and up to whole cells. A pattern that alternates from hole to hole is fitted beside it,
+    as across an odd number of holes it turns the specimen's mean. InputError if the holes aren't
+    the same specimen's.
     """
     motion = possible_motions(reference, deformed)[0]
-    before, after = motion.before.mean(axis=0), motion.after.mean(axis=0)
-    pairs = (motion.before - before).T @ (motion.after - after)
+    before = motion.before.mean(axis=0)
+    i, j = motion.index.T
+    waves = [i + j, *(k for k in (i, j) if np.ptp(k) > 1)]  # two rows alternate as they strain
+    columns = [np.ones(len(i)), *(motion.before - before).T, *((-1.0) ** k for k in waves)]
+    found = np.linalg.lstsq(np.column_stack(columns), motion.after, rcond=None)[0]
+    after, to_row, to_col = found[:3]
     # Rows go down: counter-clockwise is from +col to -row.
-    angle = math.atan2(pairs[0, 1] - pairs[1, 0], pairs[0, 0] + pairs[1, 1])
+    angle = math.atan2(to_row[1] - to_col[0], to_row[0] + to_col[1])
     first, second = ((float(row), float(col)) for row, col in (before, after))
     return RigidMotion(math.degrees(angle), first, second)
 
@@ -168,7 +176,7 @@ def _motion(
             f"{rivals + 1} ways to lay one lattice on the other match as many holes; the one with "
             "the shortest mean displacement comes first."
         )
-    return HoleMotion(before, after, rivals, tuple(text))
+    return HoleMotion(before, after, reference.index[first], rivals, tuple(text))
 
 
 def matched_holes(pair: ImagePair, lattice: HoleLattice | None) -> tuple[HoleMotion | None, str]:

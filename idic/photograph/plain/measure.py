@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.contours.measure import displacement_from_contours
+from modeharvest.idic.finite_element.contours.measure import UNSETTLED, displacement_from_contours
 from modeharvest.idic.finite_element.result import NodalResult, WholeField, refitted
 from modeharvest.idic.finite_element.system import SAMPLES, Body
 from modeharvest.idic.photograph.geometry import Geometry
@@ -27,6 +27,7 @@ from modeharvest.idic.photograph.plain.surface import (
     plain_surface,
 )
 from modeharvest.idic.setup import PhotographOptions
+from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.contour import HoleShape, signed_area
@@ -153,6 +154,8 @@ def measure_contours(
     fit = refitted(measured, ansatz, unknowns, geometry.mask)
     by_noise = replace(measured, roots=measured.roots[..., :SAMPLES])
     result = refitted(by_noise, fit.ansatz, fit.unknowns, geometry.mask)
+    if UNSETTLED in measured.warnings:
+        result = replace(result, outcome=Outcome.MAX_ITERATIONS)
     whole = WholeField(measured, fit, start="an affine motion of the holes")
     text = (_CONTOURS, *text)
     return MeasuredPhotograph(result, guess.local, text, whole, measured.warnings), contours

@@ -47,6 +47,7 @@ from modeharvest.idic.photograph.displacement import (
     misfit_of,
     residual,
     speckled,
+    uneven_light,
 )
 from modeharvest.idic.photograph.gauges import points_of, read_gauges, reading_rows, write_gauges
 from modeharvest.idic.photograph.material import find_material
@@ -398,7 +399,11 @@ class MeasureRun(StagedRun[MeasureCase]):
             "gain": float(gain),
             "offset": float(offset),
             "image_noise": noise,
-            "warnings": [*result.warnings, *misfit_of(result, noise, f[material])],
+            "warnings": [
+                *result.warnings,
+                *misfit_of(result, noise, f[material]),
+                *(uneven_light(pair, u) if self.case.brightness == 0 else ()),
+            ],
         }
 
 

@@ -33,6 +33,7 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field, write_field
+from modeharvest.idic.photograph.displacement import uneven_light
 from modeharvest.idic.photograph.gauges import points_of, reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
@@ -78,6 +79,7 @@ from modeharvest.runs.photographs.results import (
     error_fields,
     frame_numbers,
     harvest_summary,
+    in_view,
     shown_moments,
 )
 from modeharvest.runs.photographs.sequence import named_files
@@ -88,7 +90,7 @@ from modeharvest.util.files import require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import picked, to_plain
-from modeharvest.validation.onset import find_buckling, mean_strain
+from modeharvest.validation.onset import find_buckling, load_axis, mean_strain
 
 _EDGE_PX = 2
 """A camera's pixels on an edge show some background, which removing distortion mixes further."""
@@ -96,6 +98,11 @@ _ALONG = 120
 """Number of points of error bars along the longer side; they are as smooth as the ansatz."""
 _BOTH = "", "_speckle"
 """Suffixes of the file names of results by contours, and by speckle for comparison."""
+_MUCH = 0.01
+_LEFT = (
+    "{:.0f} % of the material has left the image: there v0 and v1 are extrapolated, with larger "
+    "errors than their error bars say; the numbers of the pattern are those of the rest"
+)
 
 
 @dataclass(frozen=True)
@@ -193,6 +200,10 @@ class HarvestRun(StagedRun[PhotographCase]):
             numbers.append(frame_numbers(replace(known, timeline=moments[-1:]), frame))
             if len(results) <= MOST_SHOWN:  # more might not fit into memory
                 kept[name] = frame
+        keys = "strain_x", "strain_y"
+        along = keys[load_axis(np.array([[row[key] for key in keys] for row in numbers]))]
+        numbers = [{**row, "strain": row[along]} for row in numbers]
+        moments = [replace(m, strain=row[along]) for m, row in zip(moments, numbers, strict=True)]
         shown = [moments[k].name for k in shown_moments(moments)]
         frames = (kept.get(name) or self._frame(name, results[name]) for name in shown)
         return replace(
@@ -398,16 +409,22 @@ class HarvestRun(StagedRun[PhotographCase]):
         if case.whole_field.measure or self._plain is not None or case.local.code != "none":
             w = known.less(partial(result.ansatz.displacement_at, result.unknowns))
             own["w"] = measured_spectrum(w, cell, box)
+        out = result.outside_image / max(1, result.pixels + result.outside_image)
+        left = (_LEFT.format(100 * out),) * (out > _MUCH)
+        if self._plain is None and out < 0.5 and not case.correlation.brightness.size:
+            left += uneven_light(pair, result.displacement())
+        seen = geometry.mask & in_view(result, pair.grid.x, pair.grid.y) if left else geometry.mask
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
             mask=pair.deformed_mask, result=result,
-            identifiability=identifiability(result, geometry.mask), residual_test=test, error_x=x,
+            identifiability=identifiability(result, seen), residual_test=test, error_x=x,
             error_y=y, by_noise=by_noise, by_model_error=by_model_error,
             spectrum=spectrum, pattern=pattern,
             parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()), w=w,
             whole=measured.whole, contours=beside.get(name), rigid=self.prepared.rigid.get(name),
             start_text=tuple(s for s in measured.text if s not in pattern.text),
-            warnings=(*found.warnings, *measured.warnings, *([why[name]] if name in why else ())),
+            warnings=(*left, *found.warnings, *measured.warnings,
+                      *([why[name]] if name in why else ())),
         )  # fmt: skip
 
     def _errors(self, name: str, measured: MeasuredPhotograph) -> Covariance:

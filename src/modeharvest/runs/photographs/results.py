@@ -186,6 +186,14 @@ def error_fields(
     return noise, None if model is None else field_errors(result, x, y, model)
 
 
+def in_view(result: Result, x: FloatArray, y: FloatArray) -> BoolArray:
+    """(q, p) True where points on axes [mm] are in the deformed image, too."""
+    u = result.ansatz.displacement(result.unknowns, x, y)
+    row, col = result.grid.to_px(x + u[..., 0], y[:, None] + u[..., 1])
+    rows, cols = result.grid.shape
+    return np.asarray((row >= 0.0) & (row <= rows - 1.0) & (col >= 0.0) & (col <= cols - 1.0))
+
+
 def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
     """A frame's point on the test's time line."""
     identified, noise = frame.identifiability, rms_errors(frame, frame.by_noise, cellular)
@@ -284,7 +292,7 @@ def _few_pixels(harvest: Harvest) -> tuple[FloatArray, FloatArray, BoolArray]:
 def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
     """The largest |v| and the largest length of v phi on material of the mode's region."""
     (x, y, mask), box = _few_pixels(harvest), frame.result.ansatz.modes[i].taper.cellular
-    inside = mask & box.contains(x, y[:, None])
+    inside = mask & box.contains(x, y[:, None]) & in_view(frame.result, x, y)
     ansatz, a = frame.result.ansatz, frame.result.unknowns
     v = np.where(inside, np.abs(ansatz.v(i, a, x, y)), 0.0)
     length = np.linalg.norm(ansatz.fluctuation(i, a, x, y), axis=-1)

@@ -127,13 +127,14 @@ def chosen_frames(
     for a video if the library that reads it isn't installed.
     """
     first = _reference(base, reference)
-    frames, notes, skipped = _all_frames(base, deformed, first)
+    frames, notes, skipped = _all_frames(base, deformed)
     needs_time = bool(log.file or choice.between_s or choice.per_second)
     times, source = _times(frames, choice.per_second) if needs_time else (None, ())
     notes = (*notes, *source)
     if times is not None:
         frames = tuple(replace(f, time=t) for f, t in zip(frames, times, strict=True))
     recorded, more = _recorded(frames, base, log)
+    frames = tuple(frame for frame in frames if not _are_one(frame, first))
     frames = _chosen(frames, choice, recorded)
     start, *paths = _written((first, *frames), folder, progress)
     lost = [path for path in paths if path.parent == folder / FRAMES and not path.exists()]
@@ -157,10 +158,16 @@ def _reference(base: Path, name: str) -> SequenceFrame:
     return replace(Video.of(base / file).frame(int(number or 0)), name="reference")
 
 
+def _are_one(frame: SequenceFrame, other: SequenceFrame) -> bool:
+    """Whether two frames are the same file, and of a video the same number."""
+    is_file = frame.path.absolute() == other.path.absolute()
+    return is_file and (not is_video(frame.path) or frame.number == other.number)
+
+
 def _all_frames(
-    base: Path, names: Sequence[str], reference: SequenceFrame
+    base: Path, names: Sequence[str]
 ) -> tuple[tuple[SequenceFrame, ...], tuple[str, ...], tuple[tuple[str, str], ...]]:
-    """Every frame except the reference; notes on them; files left out, with reasons."""
+    """Every frame, also the reference if it is among them; notes; files left out, with reasons."""
     frames: list[SequenceFrame] = []
     skipped: list[tuple[str, str]] = []
     notes: list[str] = []
@@ -177,9 +184,6 @@ def _all_frames(
                 continue
             taken.add(frame.name)
             frames.append(frame)
-    where = (reference.path.absolute(), reference.number)
-    frames = [frame for frame in frames if where != (frame.path.absolute(), frame.number if
-              is_video(frame.path) else None)]  # fmt: skip
     if len(frames) > 1 and not is_video(frames[0].path):
         notes += odd_numbers(frames)
     return tuple(frames), tuple(notes), tuple(skipped)

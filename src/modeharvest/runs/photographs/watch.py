@@ -50,7 +50,7 @@ from modeharvest.util.files import read_json, sha256_of, write_json
 from modeharvest.util.stages import digest, exclusive
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.growth import Prediction, follow_growth, half_wave
-from modeharvest.validation.onset import mean_strain
+from modeharvest.validation.onset import load_axis, mean_strain
 
 _PIXELS = 0.8e6
 """Approximate number of pixels of a binned photograph."""
@@ -175,7 +175,8 @@ class QuickMeasurement:
         inside = cellular.contains(*np.meshgrid(few.x, few.y))
         pattern = result.fluctuation(0, few)[inside] / self.grid.pixel_size
         self.thumbnail = pair.deformed
-        strain = mean_strain(result, cellular)[0]
+        strains = mean_strain(result, cellular)
+        strain = strains[load_axis(np.array([strains]))]
         row = {"name": path.name, "strain": strain, "amplitude_mm": amplitude, "sd_mm": sd}
         row |= {"model_sd_mm": model_sd, "pattern_px": float(np.sqrt(np.mean(pattern**2)))}
         return row | {"seconds": time.perf_counter() - begin}
