@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from large_strain import PHOTOGRAPHED
@@ -98,9 +99,13 @@ def star(folder: Path, noise: float = 0.0) -> Images:
 
 
 def rigid(
-    folder: Path, shift: tuple[float, float], turn_deg: float, noise: float = 0.0, size: float = 1.0
-) -> Images:
-    """Images of a plate that shifts and turns as a rigid body, before a dark background."""
+    folder: Path, shift: tuple[float, float], turn_deg: float, noise: float = 0.0,
+    size: float = 1.0, blur_px: float = 0.0,
+) -> Images:  # fmt: skip
+    """Images of a plate that shifts and turns as a rigid body, before a dark background.
+
+    ``blur_px``: by which noise is correlated, as in a camera of colours.
+    """
     grid, random, spec = PixelGrid.centred(500, 600, 1.0), np.random.default_rng(0), fine_speckle()
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     spec = replace(spec, standard_deviation=spec.standard_deviation / size,
@@ -112,7 +117,8 @@ def rigid(
     def image(at: np.ndarray) -> np.ndarray:
         shown = 0.2 + 0.6 * speckle(*grid.to_px(at[..., 0], at[..., 1]))
         inside = (abs(at) < sides).all(axis=-1)
-        return np.where(inside, shown, 0.06) + noise * random.standard_normal(inside.shape)
+        grain = gaussian_filter(random.standard_normal(inside.shape), blur_px)
+        return np.where(inside, shown, 0.06) + noise * grain / grain.std()
 
     u = points @ (F - np.eye(2)).T + np.array(shift)
     return [image(points), image((points - np.array(shift)) @ F)], _inside(points, sides), u
@@ -150,6 +156,9 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "shift by 0.6 px, noise of 1 %": lambda folder: rigid(folder, (0.37, -0.41), 0.0, 0.01),
     "turn by 10°, noise of 1 %": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01),
     "the same, speckle of 12 px": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01, 2.5),
+    "the same, noise blurred by 0.7 px": lambda folder: rigid(
+        folder, (5.3, -8.6), 10.0, 0.01, blur_px=0.7
+    ),
     "stretched by 30 % in one step": lambda folder: stretch(folder, [0.3]),
     "stretched by 50 % in 5 steps": lambda folder: stretch(folder, [0.1, 0.2, 0.3, 0.4, 0.5]),
     "stretched by 100 % in 10 steps": lambda f: stretch(f, [0.1 * k for k in range(1, 11)]),
