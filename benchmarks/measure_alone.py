@@ -156,7 +156,7 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "shift by 0.6 px, noise of 1 %": lambda folder: rigid(folder, (0.37, -0.41), 0.0, 0.01),
     "turn by 10°, noise of 1 %": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01),
     "the same, speckle of 12 px": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01, 2.5),
-    "the same, noise blurred by 0.7 px": lambda folder: rigid(
+    "turn by 10°, noise of 1 %, correlated": lambda folder: rigid(
         folder, (5.3, -8.6), 10.0, 0.01, blur_px=0.7
     ),
     "stretched by 30 % in one step": lambda folder: stretch(folder, [0.3]),
