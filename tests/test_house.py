@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 171, 35_167
+MOST_MODULES, MOST_LINES = 171, 35_206
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -85,7 +85,7 @@ OWN_BOUNDS = {
     FIRST_TOUCH: (3, 350),
     CONTOURS: (17, 4_362), SEQUENCES: (12, 2_804), EXPLORE: (2, 306), SHARED_DATA: (3, 451),
     GAUGES_AND_FORMATS: (9, 1_748),
-    WHOLE_DISPLACEMENT: (9, 2_300),
+    WHOLE_DISPLACEMENT: (9, 2_328),
 }  # fmt: skip
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 

@@ -329,6 +329,24 @@ def test_an_island_whose_surface_has_changed_leaves_the_other_one_alone() -> Non
     assert np.sqrt(np.mean(error_px(halves, found)[far[parts[0]]] ** 2)) < 0.05
 
 
+@pytest.mark.parametrize("blur_px", [0.0, 0.5, 0.7, 1.0])
+def test_noise_that_neighbouring_pixels_share_is_not_taken_for_displacement(
+    blur_px: float,
+) -> None:
+    """A short cut-off wavelength followed such noise: the error was several times larger."""
+    pair, random = plate_pair(quadratic_field), np.random.default_rng(0)
+    images, power = [], 1.0
+    for image in (pair.reference, pair.deformed):
+        noise = ndimage.gaussian_filter(random.standard_normal(image.shape), blur_px)
+        power = 1.0 / noise.var()
+        images.append(image + 0.05 * noise * np.sqrt(power))
+    found = measure_displacement(pair.with_images(*images), quadratic_field, options=COARSE)
+    error, sd = error_px(pair, found), found.standard_deviation_on()[pair.masks[0]]
+    assert found.noise_power == pytest.approx(power, rel=0.1)
+    assert np.sqrt(np.mean(error**2)) < 0.017 * np.sqrt(power)
+    assert np.mean(np.abs(error) < 1.96 * sd / GRID.pixel_size) > 0.9
+
+
 def test_options_are_checked() -> None:
     for wrong in ({"element_px": 1.0}, {"steps": 0}, {"cutoff_px": 0.0}, {"edge_px": -1}):
         with pytest.raises(InputError):

@@ -46,6 +46,8 @@ from modeharvest.idic.finite_element.system import SAMPLES, SOME, Linearised, Sm
 from modeharvest.util.arrays import FloatArray, IntArray
 
 _PROBES, _DEGREES = 4, 1.4
+_LEAST_SHARE = 0.05
+"""Least share of the noise that remains in the residual; less can't be told from none [-]."""
 _STEP = 1.4
 """Ratio of neighbouring cut-off wavelengths in the search."""
 _TINY = float(np.finfo(np.float64).tiny)
@@ -84,7 +86,7 @@ def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> 
     Q = at.sums.square_sum - 2.0 * float(step @ at.gradient) + float(step @ (at.M @ step))
     t = float(np.sum(z * found[:, 1:])) / _PROBES
     p = at.sums.pixels
-    value = Q / (1.0 - _DEGREES * excess * t / p) ** 2
+    value = Q / max(1.0 - _DEGREES * excess * t / p, _LEAST_SHARE) ** 2
     return Risk(cutoff_px, value / p, t, float(np.sqrt(Q / (p - t))))
 
 

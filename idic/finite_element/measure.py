@@ -41,13 +41,19 @@ from modeharvest.idic.finite_element.system import Body, Imbalance, Linearised, 
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.free_edges import FreeEdges
-from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
+from modeharvest.idic.solver.noise import (
+    NoiseTransfer,
+    estimated_noise,
+    power_of_long_waves,
+    slope_noise,
+)
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, eroded, smoothed
 from modeharvest.idic.solver.weighting import best_blur
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.elements import shape_functions
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import picked
@@ -77,6 +83,8 @@ _AROUND, _AROUND_PX = 2, 60.0
 and the shortest wave of their neighbours' displacement from which they are measured again."""
 _BORDER_PX = 2.0
 """Edges closer than this to the image's border are no edges of the body [px]."""
+_SAMPLED = 200_000
+"""Pixels from which the correlation of noise is estimated."""
 _ROUNDS = 3
 _SETTLED = 0.5
 """No further round is made if the log of the cut-off wavelength changes by less [-]."""
@@ -237,6 +245,8 @@ class _Measurement:
         images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
         self.noise = tuple(estimated_noise(image, mask).sd ** 2 for image, mask in images)
         """Variances of the noise of f and g [grey levels^2]."""
+        self.noise_power = 1.0
+        """Power of the noise at long waves, over its variance."""
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = spline_order(self.speckle_px)
 
@@ -341,7 +351,7 @@ class _Measurement:
 
     def regularise(self) -> None:
         """Find the last cut-off wavelength and its u: without a law, then with one if given."""
-        self._prepare(FULL)
+        self.noise_power = self._power_of_noise(self._prepare(FULL))
         law, given = self.options.law, self.options.cutoff_px
         self._regularised(_FIRST_PX, None if law is not None else given)
         if law is None and self.options.free_edges:
@@ -422,7 +432,23 @@ class _Measurement:
         det = np.maximum(determinant(det), _LEAST_DET)
         value = NoiseTransfer.at(u.mean(axis=1) / self.pair.grid.pixel_size, det, self.order).value
         f, g = self.noise if any(self.noise) else (1.0, 1.0)
-        return np.asarray((f * at.signal + g / det) / (f + g * value))
+        return np.asarray(self.noise_power * (f * at.signal + g / det) / (f + g * value))
+
+    def _power_of_noise(self, on: _LevelOnMesh) -> float:
+        """Power of the noise at long waves over its variance, from middle rows of the residual."""
+        pixels, px, cells = on.pixels, self.pair.grid.pixel_size, self.body.mesh.cells
+        share = min(1.0, _SAMPLED / pixels.row.size)
+        low, high = np.quantile(pixels.row, [0.5 - 0.5 * share, 0.5 + 0.5 * share])
+        alike = np.repeat(~self.unlike(), np.diff(pixels.start))
+        some = pixels.only((pixels.row >= low) & (pixels.row <= high) & alike)
+        N = shape_functions("T6", some.xi.T)
+        nodal = self.u.reshape(-1, 2)[np.repeat(cells, np.diff(some.start), axis=0)]
+        right, up = np.einsum("pk,pki->ip", N, nodal) / px
+        g, _, _ = on.images.deformed.sample(some.row - up, some.col + right)
+        residual = np.full(self.pair.grid.shape, np.nan)
+        residual[some.row, some.col] = some.grey - g
+        contrast = float(some.grey.std()) if some.grey.size else 0.0
+        return power_of_long_waves(np.nan_to_num(residual), np.isfinite(residual), contrast)
 
     def _without_edges(self, at: Linearised) -> FloatArray:
         """(n, 2, 1) change of u [mm] if twice as many rows of pixels are left out at edges, or one.
@@ -477,6 +503,6 @@ class _Measurement:
             residual_noise=here.noise,
             effective_unknowns=here.unknowns,
             library=body.library,
-            **picked(self, "start cutoff_px tried warnings contradicted"),
+            **picked(self, "start cutoff_px tried warnings contradicted noise_power"),
             **picked(at.sums, "pixels outside"),
         )

@@ -71,6 +71,8 @@ class NodalResult:
     """Warnings, one sentence each."""
     contradicted: float | None = None
     """Share of nodes on free edges where a law changes u significantly [-]; None without a law."""
+    noise_power: float = 1.0
+    """Power of the images' noise at long waves, over its variance [-]: 1 for white noise."""
     shown: str = "speckle"  # or "contours", for which residuals are distances [px]
     roots: FloatArray | None = None
     """(n, 2, k) vectors whose outer products sum up to the covariance of all nodal displacements

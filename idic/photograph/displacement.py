@@ -279,9 +279,11 @@ def uneven_light(pair: ImagePair, u: FloatArray) -> tuple[str, ...]:
 def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple[str, ...]:
     """Warn if images don't match somewhere: the residual is above noise, and not slight.
 
-    ``noise``: of the residual, rms; ``reference``: (p,) pixels of its material [grey levels].
+    ``noise``: of the residual, rms; ``reference``: (p,) pixels of its material [grey levels]. Noise
+    that neighbouring pixels share can't be known from single images: then nothing is said.
     """
-    if result.residual_rms <= max(_MISFIT * noise, _SLIGHT * float(reference.std())):
+    slight = max(_MISFIT * noise, _SLIGHT * float(reference.std()))
+    if result.noise_power > 1.0 or result.residual_rms <= slight:
         return ()
     return (
         f"The residual of the whole displacement is {result.residual_rms:.3g} grey levels, of "

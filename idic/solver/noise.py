@@ -92,6 +92,39 @@ def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise
     )
 
 
+_LEAST_NOISE, _WIDEST_PX, _WHITE = 0.005, 1.5, 1.4
+"""Noise over the speckle's standard deviation, of which less can't be told from misfit; largest
+width of a Gaussian by which noise may be correlated [px]; ratio of its estimate from means of 2 x 2
+pixels to that from pixels, up to which it is white: interpolation makes it 1.2."""
+
+
+def power_of_long_waves(residual: NDArray[Any], mask: BoolArray, contrast: float) -> float:
+    """Power of noise at long waves, over its variance: 1 if white, more if neighbours share it.
+
+    Cameras that compute colours, smooth or compress correlate the noise of neighbouring pixels. The
+    correlation is assumed to be that of white noise blurred by a Gaussian, whose width follows from
+    two estimates: by the finest details, and by those of means over 2 x 2 pixels. ``residual``
+    (rows, cols) of two images of speckle, which doesn't show in it; ``mask`` True where it counts;
+    ``contrast``: standard deviation of the speckle [grey levels].
+    """
+    rows, cols = (2 * (n // 2) for n in mask.shape)
+    means, inside = (
+        part[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).mean(axis=(1, 3))
+        for part in (residual, mask)
+    )
+    if not ndimage.binary_erosion(inside == 1.0, iterations=2).any():
+        return 1.0
+    fine, coarse = estimated_noise(residual, mask).sd, estimated_noise(means, inside == 1.0).sd
+    ratio, widths = 2.0 * coarse / max(fine, 1e-12), np.linspace(0.0, _WIDEST_PX, 61)
+    if ratio <= _WHITE or 2.0 * coarse <= _LEAST_NOISE * contrast:
+        return 1.0
+    k = np.linspace(-np.pi, np.pi, 400, endpoint=False) + np.pi / 400
+    spectra = np.exp(-(np.outer(widths, k) ** 2))
+    of_pixels, of_means = 16.0 * np.sin(k / 2) ** 4, 32.0 * np.cos(k / 2) ** 2 * np.sin(k) ** 4
+    ratios = (spectra @ of_means) / (spectra @ of_pixels)  # of variances, along one axis: of both
+    return float(np.interp(ratio, ratios, spectra.mean(axis=1) ** -2))
+
+
 _ACROSS = 128
 """Rows and columns, at most, over which means are taken: displacements vary slowly."""
 _LEAST_DET = 0.1

@@ -382,7 +382,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "median_sd_px": float(np.median(result.standard_deviation)) / px,
             "coverage": len(inside) / int(mask.sum()),
             **picked(result, "shown unknowns effective_unknowns pixels"),
-            **picked(result, "residual_rms residual_noise library"),
+            **picked(result, "residual_rms residual_noise noise_power library"),
             "warnings": list(result.warnings),
         }
         if result.shown == "contours":
