@@ -330,9 +330,7 @@ def test_an_island_whose_surface_has_changed_leaves_the_other_one_alone() -> Non
 
 
 @pytest.mark.parametrize("blur_px", [0.0, 0.5, 0.7, 1.0])
-def test_noise_that_neighbouring_pixels_share_is_not_taken_for_displacement(
-    blur_px: float,
-) -> None:
+def test_noise_that_neighbouring_pixels_share_is_not_taken_for_displacement(blur_px: float) -> None:
     """A short cut-off wavelength followed such noise: the error was several times larger."""
     pair, random = plate_pair(quadratic_field), np.random.default_rng(0)
     images, power = [], 1.0
