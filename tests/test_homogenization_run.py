@@ -167,7 +167,7 @@ def test_a_measured_mode_predicts_the_specimen_that_it_was_measured_on(
         assert 0 < both["measured_sd_rms_mm"] < 0.5 * both["measured_rms_mm"]
         ratio = both["difference_over_sd"] * both["measured_sd_rms_mm"] / both["difference_rms_mm"]
         assert 0.2 < ratio < 5.0
-    assert "Mean displacement v₀ at 13 %" in (out / "report.html").read_text("utf-8")
+    assert "Mean displacement v₀ at 13\u00a0%" in (out / "report.html").read_text("utf-8")
     assert summary["mode"]["errors"] == "model error"
     assert "phi1 is not observable" in summary["warnings"][0], "four holes are few"
     assert {s["negative_eigenvalues"] for s in summary["states"]} == {0}
