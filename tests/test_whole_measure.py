@@ -329,6 +329,20 @@ def test_an_island_whose_surface_has_changed_leaves_the_other_one_alone() -> Non
     assert np.sqrt(np.mean(error_px(halves, found)[far[parts[0]]] ** 2)) < 0.05
 
 
+def test_slivers_that_no_element_fills_are_left_out() -> None:
+    """Where a hole nearly touches an edge, as in large images: the mesh was refused as too small."""
+    grid = PixelGrid.centred(400, 600, 0.01)
+    x, y = np.meshgrid(grid.x, grid.y)
+    plate = (np.abs(x) < 2.8) & (np.abs(y) < 1.8)
+    mask = plate & (np.hypot(x, y - 1.05) > 0.75)  # which touches the upper edge
+    pattern = speckle(1, grid)
+    pair = ImagePair(pattern(x, y), pattern(x - 0.013, y), grid, mask)
+    found = measure_displacement(pair, lambda at: 0.0 * at)
+    error = (found.displacement_on()[mask] - [0.013, 0.0]) / grid.pixel_size
+    assert np.nanmax(np.abs(error)) < 0.1
+    assert np.isfinite(error).mean() > 0.999
+
+
 @pytest.mark.parametrize("blur_px", [0.0, 0.5, 0.7, 1.0])
 def test_noise_that_neighbouring_pixels_share_is_not_taken_for_displacement(blur_px: float) -> None:
     """A short cut-off wavelength followed such noise: the error was several times larger."""
