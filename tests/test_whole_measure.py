@@ -330,7 +330,7 @@ def test_an_island_whose_surface_has_changed_leaves_the_other_one_alone() -> Non
 
 
 def test_slivers_that_no_element_fills_are_left_out() -> None:
-    """Where a hole nearly touches an edge, as in large images: the mesh was refused as too small."""
+    """Where a hole touches an edge: its mesh was refused for what it leaves out."""
     grid = PixelGrid.centred(400, 600, 0.01)
     x, y = np.meshgrid(grid.x, grid.y)
     plate = (np.abs(x) < 2.8) & (np.abs(y) < 1.8)
