@@ -5,8 +5,7 @@ paper's at 0.01 mm/px), compressed by 2 %, with the paper's pattern of 3 px and 
 the start doesn't have. f is sampled from the spline of g at the true displacement, and noise of
 0.5 % is added to both. A larger image shows more holes. Each size is measured in a process of its
 own: seconds from the start (mesh included) to the written HDF5 file; the process's peak memory, and
-that before the measurement; the rms error per component. Results: docs/explanation/
-whole_field_accuracy.md.
+that before the measurement; the rms error per component. Results: docs/explanation/speed.md.
 
 Run: scripts/env python benchmarks/whole_size.py [--mpx 1 3.6 10 25 50]
 """
