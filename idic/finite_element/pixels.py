@@ -17,8 +17,9 @@ from modeharvest.util.errors import InputError
 
 _BEYOND_PX = 2
 """Largest distance of a mask's edge from the mesh, along rows and columns."""
-_SLIVERS = 1e-3
-"""Share of the mask that may be farther away: tips of slivers, which no element fills."""
+SLIVERS = 1e-3
+"""Share of a mask that a mesh made from it may leave out: tips of slivers, which no element fills.
+"""
 
 
 class ElementPixels(NamedTuple):
@@ -43,16 +44,19 @@ class ElementPixels(NamedTuple):
 
 
 class MeshPixels:
-    """Pixels of masks sorted by the elements of a T6 mesh; the sorting of a mask is kept."""
+    """Pixels of masks sorted by the elements of a T6 mesh; the sorting of a mask is kept.
 
-    def __init__(self, mesh: Mesh) -> None:
-        self.mesh = mesh
+    ``beyond``: largest share of a mask that may be beyond the mesh [-].
+    """
+
+    def __init__(self, mesh: Mesh, beyond: float = 0.0) -> None:
+        self.mesh, self.beyond = mesh, beyond
         self._kept: dict[tuple[PixelGrid, int], tuple[BoolArray, ElementPixels]] = {}
 
     def on(self, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]) -> ElementPixels:
         """Pixels of a mask (rows, cols) that are in the mesh, with f (rows, cols) there.
 
-        InputError if pixels of the mask lie farther than 2 px from those in elements.
+        InputError if more of the mask than may be lies over 2 px away from pixels in elements.
         """
         key = grid, int(mask.sum())
         kept = self._kept.get(key)
@@ -64,7 +68,7 @@ class MeshPixels:
     def _sorted(self, grid: PixelGrid, mask: BoolArray) -> ElementPixels:
         mesh = self.mesh
         located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the material")
-        _require_cover(located.mask, mask)
+        _require_cover(located.mask, mask, self.beyond)
         flat = np.flatnonzero(mask & located.mask)
         where, ones = (located.element.ravel()[flat], flat), np.ones(flat.size, np.int8)
         by_element = csr_array((ones, where), shape=(len(mesh.cells), mask.size))
@@ -74,9 +78,9 @@ class MeshPixels:
         return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, none[0], none)
 
 
-def _require_cover(covered: BoolArray, mask: BoolArray) -> None:
+def _require_cover(covered: BoolArray, mask: BoolArray, beyond: float) -> None:
     far = mask & eroded(~covered, _BEYOND_PX)
-    if far.sum() > _SLIVERS * mask.sum():
+    if far.sum() > beyond * mask.sum():
         row, col = np.argwhere(far)[0]
         raise InputError(
             f"expected a mesh that covers the mask, got one that leaves out {int(far.sum())} of "

@@ -35,7 +35,7 @@ from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.idic.finite_element.fields import mean_around
 from modeharvest.idic.finite_element.normal_equations import NodalEquations
-from modeharvest.idic.finite_element.pixels import MeshPixels
+from modeharvest.idic.finite_element.pixels import SLIVERS, MeshPixels
 from modeharvest.idic.solver.free_edges import FreeEdges, on_sides
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
@@ -173,9 +173,9 @@ class Body:
     def __init__(
         self, mesh: Mesh, mask: BoolArray | None = None, changes: tuple[str, ...] = ()
     ) -> None:
-        self.mesh, self.pixels = mesh, MeshPixels(mesh)
-        self.mask, self.changes = mask, changes
-        """(rows, cols) True on pixels used, None for all of a mask; notes on parts left out."""
+        self.mesh, self.mask, self.changes = mesh, mask, changes
+        """(rows, cols) mask from which the mesh was made, if it was; notes on parts left out."""
+        self.pixels = MeshPixels(mesh, 0.0 if mask is None else SLIVERS)
         roots = SmoothnessRoots.of(mesh)
         with ThreadPoolExecutor(1) as beside:
             samples = beside.submit(roots.samples, SAMPLES)

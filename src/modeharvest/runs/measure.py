@@ -192,7 +192,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     @cached_property
     def _body(self) -> Body:
-        return Body(self.material.mesh)
+        return Body(self.material.mesh, self.material.mask if self.case.mesh is None else None)
 
     def _material(self) -> MeshedMaterial:
         """Mesh the measurable part of the given mask, or of the material found by speckle."""
