@@ -16,11 +16,13 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from PIL import Image
+from scipy.ndimage import convolve, gaussian_filter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from large_strain import PHOTOGRAPHED
@@ -98,14 +100,47 @@ def star(folder: Path, noise: float = 0.0) -> Images:
     return [f, g], np.ones(shape.grid.shape, bool), shape.displacement(x, y)
 
 
+Camera = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
+"""Photographs a surface (rows, cols) [0 ... 1], with noise of some standard deviation."""
+
+
+def white(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
+    """A camera with white noise."""
+    return np.asarray(image + noise * random.standard_normal(image.shape))
+
+
+def smoothing(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
+    """A camera whose noise neighbouring pixels share: white noise blurred by 0.7 px."""
+    grain = gaussian_filter(random.standard_normal(image.shape), 0.7)
+    return np.asarray(image + noise * grain / grain.std())
+
+
+def colour(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
+    """The luminance of a camera of colours: white noise in a Bayer pattern, interpolated."""
+    raw, (row, col) = white(image, noise, random), np.indices(image.shape) % 2
+    cross, square = np.array([[[0, 1, 0], [1, 4, 1], [0, 1, 0]], [[1, 2, 1], [2, 4, 2], [1, 2, 1]]])
+    kinds = ((0.299, row < col, square), (0.587, row == col, cross), (0.114, row > col, square))
+    return np.asarray(sum(w * convolve(np.where(on, raw, 0.0), k / 4.0) for w, on, k in kinds))
+
+
+def compressed(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
+    """White noise, compressed to a JPEG of quality 80."""
+    grey = np.clip(np.rint(255.0 * white(image, noise, random)), 0, 255).astype(np.uint8)
+    Image.fromarray(grey).save(file := BytesIO(), "JPEG", quality=80)
+    return np.asarray(Image.open(file), dtype=float) / 255.0
+
+
+def photographed(images: Images, camera: Camera, noise: float) -> Images:
+    """The same images as a camera shows them."""
+    random = np.random.default_rng(0)
+    return [camera(image, noise, random) for image in images[0]], *images[1:]
+
+
 def rigid(
     folder: Path, shift: tuple[float, float], turn_deg: float, noise: float = 0.0,
-    size: float = 1.0, blur_px: float = 0.0,
+    size: float = 1.0, camera: Camera = white,
 ) -> Images:  # fmt: skip
-    """Images of a plate that shifts and turns as a rigid body, before a dark background.
-
-    ``blur_px``: by which noise is correlated, as in a camera of colours.
-    """
+    """Images of a plate that shifts and turns as a rigid body, before a dark background."""
     grid, random, spec = PixelGrid.centred(500, 600, 1.0), np.random.default_rng(0), fine_speckle()
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     spec = replace(spec, standard_deviation=spec.standard_deviation / size,
@@ -117,8 +152,7 @@ def rigid(
     def image(at: np.ndarray) -> np.ndarray:
         shown = 0.2 + 0.6 * speckle(*grid.to_px(at[..., 0], at[..., 1]))
         inside = (abs(at) < sides).all(axis=-1)
-        grain = gaussian_filter(random.standard_normal(inside.shape), blur_px)
-        return np.where(inside, shown, 0.06) + noise * grain / grain.std()
+        return camera(np.where(inside, shown, 0.06), noise, random)
 
     u = points @ (F - np.eye(2)).T + np.array(shift)
     return [image(points), image((points - np.array(shift)) @ F)], _inside(points, sides), u
@@ -140,7 +174,12 @@ def stretch(folder: Path, strains: Sequence[float]) -> Images:
 CASES: dict[str, Callable[[Path], Images]] = {
     "paper's specimen, 12.8 %": specimen,
     "7.8 %, before buckling": lambda folder: specimen(folder, strain=0.078),
+    "12.8 %, noise of 1 %": lambda folder: photographed(specimen(folder), white, 0.01),
     "12.8 %, noise of 2 %": lambda folder: specimen(folder, noise=0.02),
+    "12.8 %, noise of 1 %, JPEG": lambda folder: photographed(specimen(folder), compressed, 0.01),
+    "12.8 %, noise of 1 %, camera of colours": lambda folder: photographed(
+        specimen(folder), colour, 0.01
+    ),
     "12.8 %, speckle of 6 px": lambda folder: specimen(folder, size=0.5),
     "12.8 %, speckle of 4 px": lambda folder: specimen(folder, size=0.33),
     "12.8 %, 0.01 mm/px, 4 px": lambda folder: specimen(folder, size=0.33, pixel_size=0.01),
@@ -157,7 +196,16 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "turn by 10°, noise of 1 %": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01),
     "the same, speckle of 12 px": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01, 2.5),
     "turn by 10°, noise of 1 %, correlated": lambda folder: rigid(
-        folder, (5.3, -8.6), 10.0, 0.01, blur_px=0.7
+        folder, (5.3, -8.6), 10.0, 0.01, camera=smoothing
+    ),
+    "turn by 10°, noise of 1 %, camera of colours": lambda folder: rigid(
+        folder, (5.3, -8.6), 10.0, 0.01, camera=colour
+    ),
+    "the same, speckle of 12 px, noise of 2 %": lambda folder: rigid(
+        folder, (5.3, -8.6), 10.0, 0.02, 2.5, camera=colour
+    ),
+    "turn by 10°, noise of 1 %, JPEG": lambda folder: rigid(
+        folder, (5.3, -8.6), 10.0, 0.01, camera=compressed
     ),
     "stretched by 30 % in one step": lambda folder: stretch(folder, [0.3]),
     "stretched by 50 % in 5 steps": lambda folder: stretch(folder, [0.1, 0.2, 0.3, 0.4, 0.5]),
