@@ -18,8 +18,7 @@ from modeharvest.util.errors import InputError
 _BEYOND_PX = 2
 """Largest distance of a mask's edge from the mesh, along rows and columns."""
 SLIVERS = 1e-3
-"""Share of a mask that a mesh made from it may leave out: tips of slivers, which no element fills.
-"""
+"""Share of a mask that its own mesh may leave out: tips of slivers, which no element fills."""
 
 
 class ElementPixels(NamedTuple):
@@ -44,13 +43,10 @@ class ElementPixels(NamedTuple):
 
 
 class MeshPixels:
-    """Pixels of masks sorted by the elements of a T6 mesh; the sorting of a mask is kept.
-
-    ``beyond``: largest share of a mask that may be beyond the mesh [-].
-    """
+    """Pixels of masks sorted by the elements of a T6 mesh; the sorting of a mask is kept."""
 
     def __init__(self, mesh: Mesh, beyond: float = 0.0) -> None:
-        self.mesh, self.beyond = mesh, beyond
+        self.mesh, self.beyond = mesh, beyond  # largest share of a mask beyond the mesh [-]
         self._kept: dict[tuple[PixelGrid, int], tuple[BoolArray, ElementPixels]] = {}
 
     def on(self, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]) -> ElementPixels:
