@@ -75,6 +75,7 @@ class WholeFieldNumbers:
     cutoff_px: float | None = quantity("cut-off wavelength of the regularisation", "px")
     unknowns: int = quantity("unknowns", "–")
     residual_rms: float = quantity("residual, rms", "levels; contours: px")
+    noise_power: float = quantity("noise at long waves: power over variance, 1 if white", "–")
     modes: tuple[ModeBothWays, ...]
     library: str
     """Library that factorised the matrices."""
@@ -91,12 +92,12 @@ def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> Who
     by_idic, by_refit = (fit.displacement()[there] for fit in (correlated, refit))
     w = u[there] - by_idic
     return WholeFieldNumbers(
-        w_rms_px=rms(w) / px, w_max_px=float(lengths(w).max()) / px,
+        w_rms_px=rms(w) / px, w_max_px=float(lengths(w).max()) / px, start=whole.start,
         rms_beyond_refit_px=rms(u[there] - by_refit) / px,
         rms_refit_to_idic_px=rms(by_refit - by_idic) / px,
         sd_px=rms(measured.standard_deviation) / px, coverage=float(there.sum() / mask.sum()),
         modes=tuple(_both_ways(refit, correlated, i) for i in range(len(refit.ansatz.modes))),
-        **picked(measured, "cutoff_px unknowns residual_rms library warnings"), start=whole.start,
+        **picked(measured, "cutoff_px unknowns residual_rms noise_power library warnings"),
     )  # fmt: skip
 
 
@@ -144,9 +145,8 @@ def compare_whole(
     mask : (rows, cols) True on material of the undeformed specimen.
     """
     measured, refit, grid, px = whole.measured, whole.refit, best.grid, best.grid.pixel_size
-    u = measured.displacement_on(grid)
-    error = true - u
-    there = mask & np.isfinite(u[..., 0])
+    error = true - measured.displacement_on(grid)
+    there = mask & np.isfinite(error[..., 0])
     inside = np.abs(error) < _NORMAL_95 * measured.standard_deviation_on(grid)
     labels = np.where(there, regions(mask, grid, specimen), -1)
     places = {name: labels == REGIONS.index(name) for name in REGIONS}

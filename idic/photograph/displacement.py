@@ -57,7 +57,7 @@ _DENSER = 5, 16
 """
 _SMOOTH_PX = 60.0
 """Shorter waves of an initial guess come from motions in whole pixels, and would remain."""
-_FEW, _MANY, _SOME = 0.75, 4.0, 2.0
+_SMOOTHER_FROM, _SMOOTHED_OVER, _LESS_SMOOTH = 0.75, 4.0, 2.0
 """Ratio of cut-off to shortest wave of the initial guess from which on a smoother one is tried, and
 over how many cut-offs that one is smoothed; over how many if the images then require a shorter
 cut-off (over one, errors of smooth waves are 1.4 times their standard deviation)."""
@@ -112,14 +112,14 @@ def displacement_from(
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
     pair_alike = seen(_AT_EDGE_PX)
     found = measured(pair_alike, start)
-    if found.cutoff_px is None or found.cutoff_px < _FEW * _SMOOTH_PX:
+    if found.cutoff_px is None or found.cutoff_px < _SMOOTHER_FROM * _SMOOTH_PX:
         return found
     # Shorter waves of the start are noise of the same images, which no error estimate would count.
     wave = found.cutoff_px * pair.grid.pixel_size
-    smoother = measured(pair_alike, body.smoothed(start, _MANY * wave))
+    smoother = measured(pair_alike, body.smoothed(start, _SMOOTHED_OVER * wave))
     if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
         return smoother
-    return measured(pair_alike, body.smoothed(start, _SOME * wave))
+    return measured(pair_alike, body.smoothed(start, _LESS_SMOOTH * wave))
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:
