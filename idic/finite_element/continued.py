@@ -8,6 +8,7 @@ pixels of the material have when they are continued from the others.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,9 @@ _REACH_PX = 4
 _SIGMA_PX = 1.5
 """Standard deviation of the Gaussian weights of the material's pixels for that."""
 _WINDOW_PX = 6
+_BLURS, _MOST = 2.0, 1 / 16
+"""Width of the strip along the image's border where a blur depends on what is beyond [blurs]; at
+most this share of the shorter side."""
 _RIDGE = 1e-3
 """Regularisation of polynomials that too few pixels determine, over the sum of weights."""
 
@@ -38,7 +42,11 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     order : of the spline that samples g.
     """
     if level != FULL:
-        return level_pair(pair, level, edge_px, order)
+        coarse = level_pair(pair, level, edge_px, order)
+        within = np.zeros(coarse.mask.shape, np.bool_)
+        width = round(min(_BLURS * level.blur, _MOST * min(within.shape)))
+        within[width : within.shape[0] - width, width : within.shape[1] - width] = True
+        return replace(coarse, mask=coarse.mask & within, valid=within)
     inside, mask = pair.masks
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
     g, inside = continued_spline(pair.deformed, mask, order), eroded(inside, edge_px)

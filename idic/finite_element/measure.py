@@ -55,6 +55,7 @@ from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.elements import shape_functions
 from modeharvest.util.errors import InputError, require_within
+from modeharvest.util.masks import grown
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import picked
 
@@ -81,6 +82,10 @@ _SOME_PIXELS = 200
 _AROUND, _AROUND_PX = 2, 60.0
 """Layers of elements around such elements that count, too, as few speckles also match elsewhere;
 and the shortest wave of their neighbours' displacement from which they are measured again."""
+_DIFFERS, _BESIDE_PX, _MOST_HIDDEN = 0.5, 2.0, 0.5
+"""Where that doesn't help, pixels there don't count if their residual, beyond noise, is larger than
+this, over the speckle's standard deviation; nor those so close to them, which splines mix; unless
+that concerns a larger share of the material."""
 _BORDER_PX = 2.0
 """Edges closer than this to the image's border are no edges of the body [px]."""
 _SAMPLED = 200_000
@@ -240,6 +245,7 @@ class _Measurement:
         self.contradicted: float | None = None
         self.edges: FreeEdges | None = None
         self.by_edges: FloatArray = np.zeros_like(self.u)  # change of u by the relation at edges
+        self.hidden = np.zeros(pair.grid.shape, np.bool_)  # pixels that don't count
         self.tried: tuple[Risk, ...] = ()
         self.warnings = body.changes
         images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
@@ -254,7 +260,9 @@ class _Measurement:
         if self.level is None or self.level.level != level:
             order = self.order if level == FULL else 5
             images = images_on(self.pair, level, self.options.edge_px, order)
-            pixels = self.body.pixels.on(images.grid, images.mask, images.reference)
+            (rows, cols), n = images.mask.shape, level.factor
+            hidden = self.hidden[: rows * n, : cols * n].reshape(rows, n, cols, n).any(axis=(1, 3))
+            pixels = self.body.pixels.on(images.grid, images.mask & ~hidden, images.reference)
             self.level, self.kept = _LevelOnMesh(level, images, pixels), None
             if level == FULL:
                 self.level = self._weighed_by_reference(self.level)
@@ -332,22 +340,53 @@ class _Measurement:
         return np.asarray(found)
 
     def again_where_unlike(self, *stages: _Stage) -> None:
-        """Measure again from the displacement around where images don't match, while that helps."""
-        body, wave = self.body, _AROUND_PX * self.pair.grid.pixel_size
-        pixels = np.diff(self._prepare(FULL).pixels.start)
+        """Measure again from the displacement around where images don't match, while that helps.
+
+        Where it doesn't, pixels don't count: paint may have come off, or something hides it.
+        """
+        body, pixels = self.body, np.diff(self._prepare(FULL).pixels.start)
         while pixels[unlike := self.unlike()].sum() > _SOME_PIXELS:
-            known, last = body.away_from(unlike, _AROUND)[:, None], (self.u, self.prior)
-            start, u = (
-                np.where(known, nodal, body.smoothed(nodal, wave, known[:, 0]))
-                for nodal in (self.start, self.u.reshape(-1, 2))
-            )
-            self.prior, self.u = Smoothness(body, start), u.ravel()
+            last, known = (self.u, self.prior), body.away_from(unlike, _AROUND)
+            start = np.where(known[:, None], self.start, self._smoothed(self.start, known))
+            self._start_from(start, known)
             for stage in stages:
                 self.through(stage)
             if self.unlike().sum() >= unlike.sum():
                 (self.u, self.prior), self.kept = last, None
+                self._hide(~known[body.mesh.cells].any(axis=1), *stages)
                 break
             self.start = start
+
+    def _hide(self, cells: BoolArray, *stages: _Stage) -> None:
+        """Measure without the pixels of elements (m,), then with those of them that match."""
+        on, full = self._prepare(FULL), [stage for stage in stages if stage.level == FULL]
+        mine = np.repeat(cells, np.diff(on.pixels.start))
+        if mine.mean() > _MOST_HIDDEN:
+            return
+        around, before = on.pixels.only(mine), self.hidden
+        differ = np.ones(around.row.size, np.bool_)
+        limit = _DIFFERS * float(on.pixels.grey.std()) + _BY_CHANCE * np.sqrt(sum(self.noise))
+        for then in (stages, full, full):  # blurred images mix them with what is around
+            hidden = np.zeros_like(before)
+            hidden[around.row[differ], around.col[differ]] = True
+            self.hidden, self.level = before | grown(hidden, _BESIDE_PX), None
+            blank = np.diff(self._prepare(FULL).pixels.start) == 0
+            known = self.body.away_from(blank)
+            self.start = self._smoothed(self.u.reshape(-1, 2), known)
+            self._start_from(self.start, known)
+            for stage in then:
+                self.through(stage)
+            residual = self._residual(on, around)[around.row, around.col]
+            differ = ~(np.abs(residual) <= limit)
+
+    def _smoothed(self, nodal: FloatArray, known: BoolArray) -> FloatArray:
+        return self.body.smoothed(nodal, _AROUND_PX * self.pair.grid.pixel_size, known)
+
+    def _start_from(self, start: FloatArray, known: BoolArray) -> None:
+        """Start from (n, 2) [mm], with u where it is known (n,), else that of its neighbours."""
+        nodal = self.u.reshape(-1, 2)
+        u = np.where(known[:, None], nodal, self._smoothed(nodal, known))
+        self.prior, self.u, self.kept = Smoothness(self.body, start), u.ravel(), None
 
     def regularise(self) -> None:
         """Find the last cut-off wavelength and its u: without a law, then with one if given."""
@@ -436,19 +475,24 @@ class _Measurement:
 
     def _power_of_noise(self, on: _LevelOnMesh) -> float:
         """Power of the noise at long waves over its variance, from middle rows of the residual."""
-        pixels, px, cells = on.pixels, self.pair.grid.pixel_size, self.body.mesh.cells
+        pixels = on.pixels
         share = min(1.0, _SAMPLED / pixels.row.size)
         low, high = np.quantile(pixels.row, [0.5 - 0.5 * share, 0.5 + 0.5 * share])
         alike = np.repeat(~self.unlike(), np.diff(pixels.start))
         some = pixels.only((pixels.row >= low) & (pixels.row <= high) & alike)
-        N = shape_functions("T6", some.xi.T)
+        residual = self._residual(on, some)
+        contrast = float(some.grey.std()) if some.grey.size else 0.0
+        return power_of_long_waves(np.nan_to_num(residual), np.isfinite(residual), contrast)
+
+    def _residual(self, on: _LevelOnMesh, some: ElementPixels) -> FloatArray:
+        """(rows, cols) f - g(x + u) of some of the unfiltered pixels, else NaN [grey levels]."""
+        N, cells = shape_functions("T6", some.xi.T), self.body.mesh.cells
         nodal = self.u.reshape(-1, 2)[np.repeat(cells, np.diff(some.start), axis=0)]
-        right, up = np.einsum("pk,pki->ip", N, nodal) / px
+        right, up = np.einsum("pk,pki->ip", N, nodal) / self.pair.grid.pixel_size
         g, _, _ = on.images.deformed.sample(some.row - up, some.col + right)
         residual = np.full(self.pair.grid.shape, np.nan)
         residual[some.row, some.col] = some.grey - g
-        contrast = float(some.grey.std()) if some.grey.size else 0.0
-        return power_of_long_waves(np.nan_to_num(residual), np.isfinite(residual), contrast)
+        return residual
 
     def _without_edges(self, at: Linearised) -> FloatArray:
         """(n, 2, 1) change of u [mm] if twice as many rows of pixels are left out at edges, or one.
@@ -477,11 +521,18 @@ class _Measurement:
             )
         counts = np.diff(self._prepare(FULL).pixels.start)
         blank = float(counts[at.signal == 0.0].sum() / counts.sum())
+        guess = "there the displacement is the smoothest that fits around, and its standard "
         if blank > _BLANK:
             self.warnings += (
                 f"{100 * blank:.0f} % of the material shows no speckle that is in both images: "
-                "there the displacement is the smoothest that fits around, and its standard "
-                "deviation a guess.",
+                f"{guess}deviation a guess.",
+            )
+        if self.hidden.any():
+            row, col = np.argwhere(self.hidden).mean(axis=0)
+            share = 100.0 * self.hidden.sum() / (self.hidden.sum() + counts.sum())
+            self.warnings += (
+                f"Around row {row:.0f}, column {col:.0f} the surface has changed, or is hidden (on "
+                f"{share:.2g} % of the material): {guess}deviation a guess.",
             )
         if counts[unlike := self.unlike(at)].sum() > _SOME_PIXELS:
             worst = np.argmax(at.sums.squares / np.maximum(at.sums.weights, 1.0))
