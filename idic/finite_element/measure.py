@@ -82,10 +82,10 @@ _SOME_PIXELS = 200
 _AROUND, _AROUND_PX = 2, 60.0
 """Layers of elements around such elements that count, too, as few speckles also match elsewhere;
 and the shortest wave of their neighbours' displacement from which they are measured again."""
-_DIFFERS, _BESIDE_PX, _MOST_HIDDEN = 0.5, 2.0, 0.5
-"""Where that doesn't help, pixels there don't count if their residual, beyond noise, is larger than
-this, over the speckle's standard deviation; nor those so close to them, which splines mix; unless
-that concerns a larger share of the material."""
+_DIFFERS, _BESIDE_PX, _MOST_HIDDEN = 0.5, 4.0, 0.8
+"""Where that doesn't help, pixels don't count if their residual, beyond noise, is larger than this,
+over the speckle's standard deviation, nor pixels so close to them, which splines mix; unless that
+concerns a larger share of the material."""
 _BORDER_PX = 2.0
 """Edges closer than this to the image's border are no edges of the body [px]."""
 _SAMPLED = 200_000
@@ -360,24 +360,22 @@ class _Measurement:
     def _hide(self, cells: BoolArray, *stages: _Stage) -> None:
         """Measure without the pixels of elements (m,), then with those of them that match."""
         on, full = self._prepare(FULL), [stage for stage in stages if stage.level == FULL]
-        mine = np.repeat(cells, np.diff(on.pixels.start))
-        if mine.mean() > _MOST_HIDDEN:
+        around, before = on.pixels.only(np.repeat(cells, np.diff(on.pixels.start))), self.hidden
+        if around.row.size > _MOST_HIDDEN * on.pixels.row.size:
             return
-        around, before = on.pixels.only(mine), self.hidden
         differ = np.ones(around.row.size, np.bool_)
         limit = _DIFFERS * float(on.pixels.grey.std()) + _BY_CHANCE * np.sqrt(sum(self.noise))
         for then in (stages, full, full):  # blurred images mix them with what is around
             hidden = np.zeros_like(before)
             hidden[around.row[differ], around.col[differ]] = True
             self.hidden, self.level = before | grown(hidden, _BESIDE_PX), None
-            blank = np.diff(self._prepare(FULL).pixels.start) == 0
-            known = self.body.away_from(blank)
+            known = self.body.away_from(np.diff(self._prepare(FULL).pixels.start) == 0)
             self.start = self._smoothed(self.u.reshape(-1, 2), known)
             self._start_from(self.start, known)
             for stage in then:
                 self.through(stage)
             residual = self._residual(on, around)[around.row, around.col]
-            differ = ~(np.abs(residual) <= limit)
+            differ = around.with_rest_of_elements(~(np.abs(residual) <= limit))
 
     def _smoothed(self, nodal: FloatArray, known: BoolArray) -> FloatArray:
         return self.body.smoothed(nodal, _AROUND_PX * self.pair.grid.pixel_size, known)

@@ -41,6 +41,12 @@ class ElementPixels(NamedTuple):
         start = np.concatenate([[0], np.cumsum(keep)])[self.start]
         return ElementPixels(start, *(p[..., keep] if p.shape[-1] else p for p in self[1:]))
 
+    def with_rest_of_elements(self, chosen: BoolArray) -> BoolArray:
+        """(p,) the chosen pixels (p,), with all others of elements of which most are chosen."""
+        count = np.diff(self.start)
+        many = np.diff(np.concatenate([[0], np.cumsum(chosen)])[self.start]) > 0.5 * count
+        return chosen | np.repeat(many, count)
+
 
 class MeshPixels:
     """Pixels of masks sorted by the elements of a T6 mesh; the sorting of a mask is kept."""
