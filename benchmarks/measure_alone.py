@@ -100,6 +100,18 @@ def star(folder: Path, noise: float = 0.0) -> Images:
     return [f, g], np.ones(shape.grid.shape, bool), shape.displacement(x, y)
 
 
+def filled(folder: Path, shift: tuple[float, float], turn_deg: float, noise: float) -> Images:
+    """Images of a surface that fills the picture, moved as a rigid body."""
+    return rigid(folder, shift, turn_deg, noise, sides=(1e6, 1e6))
+
+
+def reflecting(images: Images, rows: slice, cols: slice) -> Images:
+    """The same images with the reflection of a lamp, at the same place in all of them."""
+    for image in images[0]:
+        image[rows, cols] = 1.0
+    return images
+
+
 Camera = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 """Photographs a surface (rows, cols) [0 ... 1], with noise of some standard deviation."""
 
@@ -138,7 +150,7 @@ def photographed(images: Images, camera: Camera, noise: float) -> Images:
 
 def rigid(
     folder: Path, shift: tuple[float, float], turn_deg: float, noise: float = 0.0,
-    size: float = 1.0, camera: Camera = white,
+    size: float = 1.0, camera: Camera = white, sides: tuple[float, float] = (220.0, 180.0),
 ) -> Images:  # fmt: skip
     """Images of a plate that shifts and turns as a rigid body, before a dark background."""
     grid, random, spec = PixelGrid.centred(500, 600, 1.0), np.random.default_rng(0), fine_speckle()
@@ -147,18 +159,17 @@ def rigid(
                    blur_px=spec.blur_px * size)  # fmt: skip
     F, speckle = np.array([[c, -s], [s, c]]), Speckle(spec, grid.shape)
     points = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
-    sides = np.array([220.0, 180.0])
 
     def image(at: np.ndarray) -> np.ndarray:
         shown = 0.2 + 0.6 * speckle(*grid.to_px(at[..., 0], at[..., 1]))
-        inside = (abs(at) < sides).all(axis=-1)
+        inside = _inside(at, sides)
         return camera(np.where(inside, shown, 0.06), noise, random)
 
     u = points @ (F - np.eye(2)).T + np.array(shift)
     return [image(points), image((points - np.array(shift)) @ F)], _inside(points, sides), u
 
 
-def _inside(points: np.ndarray, sides: np.ndarray) -> np.ndarray:
+def _inside(points: np.ndarray, sides: tuple[float, float]) -> np.ndarray:
     return np.asarray((abs(points) < sides).all(axis=-1))
 
 
@@ -180,6 +191,9 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "12.8 %, noise of 1 %, camera of colours": lambda folder: photographed(
         specimen(folder), colour, 0.01
     ),
+    "12.8 %, noise of 1 %, a reflection": lambda folder: reflecting(
+        photographed(specimen(folder), white, 0.01), slice(400, 460), slice(300, 380)
+    ),
     "12.8 %, speckle of 6 px": lambda folder: specimen(folder, size=0.5),
     "12.8 %, speckle of 4 px": lambda folder: specimen(folder, size=0.33),
     "12.8 %, 0.01 mm/px, 4 px": lambda folder: specimen(folder, size=0.33, pixel_size=0.01),
@@ -191,6 +205,11 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "star": star,
     "star, noise of 2 %": lambda folder: star(folder, 0.02),
     "shift by 40 px": lambda folder: rigid(folder, (31.3, 25.7), 0.0),
+    "picture filled, shift by 3 px": lambda folder: filled(folder, (2.4, -1.7), 0.0, 0.0),
+    "picture filled, turn by 3°": lambda folder: filled(folder, (2.4, -1.7), 3.0, 0.0),
+    "picture filled, turn by 3°, a reflection": lambda folder: reflecting(
+        filled(folder, (2.4, -1.7), 3.0, 0.0), slice(200, 260), slice(300, 380)
+    ),
     "turn by 10°": lambda folder: rigid(folder, (5.3, -8.6), 10.0),
     "shift by 0.6 px, noise of 1 %": lambda folder: rigid(folder, (0.37, -0.41), 0.0, 0.01),
     "turn by 10°, noise of 1 %": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01),

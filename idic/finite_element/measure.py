@@ -35,7 +35,7 @@ from modeharvest.idic.finite_element.cutoff import (
 from modeharvest.idic.finite_element.fields import determinant, element_gradients
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.normal_equations import normal_equations
-from modeharvest.idic.finite_element.pixels import ElementPixels
+from modeharvest.idic.finite_element.pixels import ElementPixels, flat
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body, Imbalance, Linearised, Smoothness
 from modeharvest.idic.result import Result
@@ -236,6 +236,16 @@ class _Measurement:
                 f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
             )
         pair = pair if body.mask is None else replace(pair, mask=pair.masks[0] & body.mask)
+        self.speckle_px = speckle_size(pair.reference, pair.mask)
+        self.order = spline_order(self.speckle_px)
+        blank, hidden = (
+            grown(flat(image, mask, self.speckle_px), _BESIDE_PX)
+            for image, mask in zip((pair.reference, pair.deformed), pair.masks, strict=True)
+        )
+        self.hidden = self.blank = blank & pair.masks[0]
+        """(rows, cols) True for pixels that don't count; for those of them without speckle."""
+        if hidden.any() and (pair.deformed_mask is not None or pair.masks[0].all()):
+            pair = replace(pair, deformed_mask=pair.masks[1] & ~hidden)
         self.pair, self.body, self.start, self.options = pair, body, begin, options
         self.prior: Smoothness | Imbalance = Smoothness(body, begin)
         self.u = begin.ravel().copy()
@@ -245,7 +255,6 @@ class _Measurement:
         self.contradicted: float | None = None
         self.edges: FreeEdges | None = None
         self.by_edges: FloatArray = np.zeros_like(self.u)  # change of u by the relation at edges
-        self.hidden = np.zeros(pair.grid.shape, np.bool_)  # pixels that don't count
         self.tried: tuple[Risk, ...] = ()
         self.warnings = body.changes
         images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
@@ -253,8 +262,6 @@ class _Measurement:
         """Variances of the noise of f and g [grey levels^2]."""
         self.noise_power = 1.0
         """Power of the noise at long waves, over its variance."""
-        self.speckle_px = speckle_size(pair.reference, pair.mask)
-        self.order = spline_order(self.speckle_px)
 
     def _prepare(self, level: Level) -> _LevelOnMesh:
         if self.level is None or self.level.level != level:
@@ -518,16 +525,16 @@ class _Measurement:
                 "the mesh, or of the mask, shows no speckle that is in both images; check them"
             )
         counts = np.diff(self._prepare(FULL).pixels.start)
-        blank = float(counts[at.signal == 0.0].sum() / counts.sum())
+        total, lost = counts.sum() + self.hidden.sum(), int(self.blank.sum())
+        blank = float((counts[at.signal == 0.0].sum() + lost) / total)
         guess = "there the displacement is the smoothest that fits around, and its standard "
         if blank > _BLANK:
             self.warnings += (
                 f"{100 * blank:.0f} % of the material shows no speckle that is in both images: "
                 f"{guess}deviation a guess.",
             )
-        if self.hidden.any():
-            row, col = np.argwhere(self.hidden).mean(axis=0)
-            share = 100.0 * self.hidden.sum() / (self.hidden.sum() + counts.sum())
+        if (changed := self.hidden & ~self.blank).any():
+            (row, col), share = np.argwhere(changed).mean(axis=0), 100.0 * changed.sum() / total
             self.warnings += (
                 f"Around row {row:.0f}, column {col:.0f} the surface has changed, or is hidden (on "
                 f"{share:.2g} % of the material): {guess}deviation a guess.",

@@ -6,19 +6,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
-from modeharvest.util.arrays import BoolArray
+from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
+from modeharvest.util.masks import large_parts
 
 _BEYOND_PX = 2
 """Largest distance of a mask's edge from the mesh, along rows and columns."""
 SLIVERS = 1e-3
 """Share of a mask that its own mesh may leave out: tips of slivers, which no element fills."""
+
+_FLAT, _MOST_FLAT, _SPECKLES = 0.01, 0.2, 2.0
+"""Largest difference of neighbours, over the speckle's standard deviation, where all is one grey
+level; largest share of the material, and least size of such a place [squares of a speckle]."""
 
 
 class ElementPixels(NamedTuple):
@@ -78,6 +84,18 @@ class MeshPixels:
         xi = located.values.reshape(2, -1)[:, by_element.indices].astype(np.float32)
         none, start = np.empty((2, 0), np.float32), by_element.indptr.astype(np.int64)
         return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, none[0], none)
+
+
+def flat(image: FloatImage, mask: BoolArray, speckle_px: float) -> BoolArray:
+    """(rows, cols) True where a mask's material has one grey level over many speckles.
+
+    Such are reflections of lamps, which don't move with the material. None are found where much of
+    the pattern has few grey levels, as black and white ones have.
+    """
+    low, high = minimum_filter(image, 3), maximum_filter(image, 3)
+    same = mask & (high - low <= _FLAT * float(image[mask].std() if mask.any() else 0.0))
+    is_pattern = same.sum() > _MOST_FLAT * mask.sum()
+    return large_parts(same & (not is_pattern), _SPECKLES * speckle_px**2)
 
 
 def _require_cover(covered: BoolArray, mask: BoolArray, beyond: float) -> None:
