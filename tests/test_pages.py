@@ -73,7 +73,7 @@ def names(pages: list[Path]) -> list[str]:
 def given(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """Files and names that pages begin with: an image pair, its result, a field of another code."""
     folder = tmp_path_factory.mktemp("given")
-    solution = mh.Solution.read(shipped_solution("paper-virtual") or "")
+    solution = mh.Solution.read(shipped_solution("paper-virtual"))
     spec = mh.ImagingSpec(pixel_size=0.05)
     images = mh.make_images(solution, spec, folder / "images", [0.128])
     pair = images.pair(0.128)
