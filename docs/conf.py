@@ -27,6 +27,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "mathml",
     "docstrings",
+    "long_cells",
     "api_pages",
     "cli_pages",
     "key_pages",

@@ -82,8 +82,8 @@ def test_codes_that_are_not_measured_again_keep_their_columns(tables: ModuleType
     never = lambda code, case: False  # noqa: E731
     assert tables.standard(board, cases, never, earlier) == [
         "| rms [px], set 123 | mine | theirs |", "|---|---|---|", "| a | 0.012 | 0.02 |",
-        "| b | 0.4 (91 %) | none |", "| cases that count | 2 | 1 |",
-        "| geometric mean over them | 0.07 | 0.02 |",
+        "| b | 0.40 (91 %) | none |", "| cases that count | 2 | 1 |",
+        "| geometric mean over them | 0.070 | 0.02 |",
     ]  # fmt: skip
     other_set = {**board, "set": "124"}
     assert "theirs" not in "".join(tables.standard(other_set, cases, never, earlier))

@@ -25,7 +25,7 @@ def comparison(grading: Grading) -> list[str]:
         **{f"rms, {name}": lambda s, name=name: two_digits(s.by_region[name].rms_px)  # type: ignore[misc]
            for name in REGIONS},
         "points": lambda s: f"{s.everywhere.points:,}".replace(",", " "),
-        "returned": lambda s: f"{100 * s.everywhere.returned:.1f} %",
+        "returned": lambda s: f"{100 * s.everywhere.returned:.3g} %",
         "material covered": lambda s: f"{100 * s.covered:.0f} %",
         f"rms on the {shared}": lambda s: two_digits(of[s.source].rms_px),
         "largest there": lambda s: two_digits(of[s.source].max_px),
@@ -59,7 +59,7 @@ def standard(
 
 def two_digits(value: float) -> str:
     """The number with two significant digits; a dash for NaN."""
-    return f"{value:.2g}" if value == value else NOT_APPLICABLE
+    return f"{value:#.2g}".rstrip(".") if value == value else NOT_APPLICABLE
 
 
 def markdown(corner: str, columns: Mapping[str, Mapping[str, str]]) -> list[str]:
