@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from modeharvest.cli.messages import UNUSABLE, OutFolder, bars, folder_option
+from modeharvest.cli.messages import UNUSABLE, OutFolder, bars, folder_option, refuse
 
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of a finished run or set.")]
 
@@ -74,9 +74,8 @@ def leaderboard(
         board = ranked(codes, truth, out, progress)
     for n, row in enumerate(board["codes"], 1):
         print(f"{n}. {row['code']}: rms {row['rms_px']:.3g} px, mean of {row['counted']} cases")
-    for why in board["refused"].values():
-        print(f"not graded: {why}")
     print(f"report: {out / 'report.html'}")
+    refuse(board["refused"])
 
 
 COMMANDS = (verify, standard, leaderboard)
