@@ -211,7 +211,9 @@ class _LoadSearch:
             if least.value <= 0:
                 return self._root(load, target)
             if path_ends:
-                return self._stable(target, f"Newton's method did not converge beyond e = {target:.6g}")
+                return self._stable(
+                    target, f"Newton's method did not converge beyond e = {target:.6g}"
+                )
             rate = (previous.value - least.value) / (target - load)
             ahead = 1.05 * least.value / rate if rate > 0 else math.inf
             step = min(max(ahead, 0.2 * step), 3.0 * step, self.search.largest_step)

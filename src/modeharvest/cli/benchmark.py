@@ -60,7 +60,7 @@ def score(
     name: CodeNames = None,
     unit: Annotated[
         list[str] | None,
-        typer.Option("--unit", help="px or mm; 'file': as its columns' names say.", metavar="UNIT"),
+        typer.Option("--unit", help="px or mm; 'file': as the columns' names say.", metavar="UNIT"),
     ] = None,
     y_axis: YAxes = None,
     first_pixel: FirstPixels = None,

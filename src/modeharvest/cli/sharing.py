@@ -15,10 +15,10 @@ Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of a fini
 def share(
     folder: Folder,
     licence: Annotated[
-        str, typer.Option("--licence", help="CC-BY-4.0, CC0-1.0, or its https:// address.")
+        str, typer.Option("--licence", help="CC-BY-4.0, CC0-1.0, or another's https:// address.")
     ] = "CC-BY-4.0",
     author: Annotated[
-        str, typer.Option("--author", help="'Name <https://orcid.org/...>' of who made it.")
+        str, typer.Option("--author", help="Who made it: 'Name <https://orcid.org/...>'.")
     ] = "",
     title: Annotated[str, typer.Option("--title", help="Title; by default the run's.")] = "",
 ) -> None:
