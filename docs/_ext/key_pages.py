@@ -330,7 +330,7 @@ def page(title: str, model: type[CaseModel], command: str, others: dict[type[Any
         if label in others:
             continue
         others[label] = title
-        head = f"[{path}]" + (f' with kind = "{kind}"' if kind else "")
+        head = f"[{path}]" + (f' with ``kind = "{kind}"``' if kind else "")
         text += f".. _{label}:\n\n" + heading(head, "-")
         summary = inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0]
         text += summary.replace("\n", " ") + "\n\n"
