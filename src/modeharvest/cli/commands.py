@@ -5,6 +5,7 @@ Commands import the modules they need when they are called, so that ``--help`` i
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -242,7 +243,8 @@ def _watch(experiment: Path, out: Path, folder: Path, until_still: float | None)
 
     print(watch_text(watch(experiment, out, folder, until_still=until_still,
                            show=lambda line: print(line, flush=True))))  # fmt: skip
-    print(f"measure them in full by: modeharvest harvest {experiment} --out {out}")
+    command = shlex.join(["modeharvest", "harvest", str(experiment), "--out", str(out)])
+    print(f"measure them in full by: {command}")
 
 
 def measure(
