@@ -412,10 +412,13 @@ def test_no_panel_has_controls_beyond_its_edge(tab: Tab, content: Any, width: in
         for count in (1, 3, 4):
             tab.run(f"explorer.arrange({count}).then(() => {{ explorer.panels[0].quantity ="
                     f" {residual}; return explorer.draw(); }}).then(() => 0)")  # fmt: skip
-            assert [] == tab.run(
-                "explorer.panels.flatMap(p => [...p.element.querySelectorAll('*')].filter(e =>"
-                " e.getBoundingClientRect().right > p.element.getBoundingClientRect().right + 0.5)"
-                ".map(e => e.className))"
+            assert (
+                tab.run(
+                    "explorer.panels.flatMap(p => [...p.element.querySelectorAll('*')].filter(e =>"
+                    " e.getBoundingClientRect().right > p.element.getBoundingClientRect().right + 0.5)"
+                    ".map(e => e.className))"
+                )
+                == []
             )
     finally:
         tab.resize(1280, 900)

@@ -83,6 +83,18 @@ def test_a_crate_says_all_that_an_archive_asks_for(
     assert set(pointed) - {"https://w3id.org/ro/crate/1.1"} <= set(found)
 
 
+def test_a_study_s_columns_have_units_and_a_run_its_command(folder: Path) -> None:
+    (folder / "table.csv").write_text("seed,w_px,curvature_sd_mm\n1,2,3\n")
+    run = {key: value for key, value in SUMMARY.items() if key != "command"} | {"snapshots": []}
+    write_json(folder / "summary.json", run)
+    found = entities(write_crate(folder))
+    measured = [found[of["@id"]] for of in found["./"]["variableMeasured"]]
+    assert [(m["name"], m["unitText"]) for m in measured[2:]] == [
+        ("w_px", "px"), ("curvature_sd_mm", "mm")
+    ]  # fmt: skip
+    assert found["#made"]["name"].startswith("modeharvest run CASE.toml --out DIR, ")
+
+
 def values_of(entity: dict[str, Any]) -> list[dict[str, str]]:
     each = [v if isinstance(v, list) else [v] for v in entity.values()]
     return [value for values in each for value in values if isinstance(value, dict)]

@@ -143,9 +143,8 @@ def findings(summary: Summary) -> list[str]:
             text.append(text_of("lattice-error", load=load, error=error, order=point["order"],
                                 share=point["error"] / point["load"]))  # fmt: skip
     elif point is not None:
-        text.append(
-            f"Under {_under(point['loading'])}: {load.in_units(summary['outcome'])}; {proof(point)}."
-        )
+        outcome = load.in_units(summary["outcome"])
+        text.append(f"Under {_under(point['loading'])}: {outcome}; {proof(point)}.")
     for part in summary["zone"]:
         at = load.text(part["load"])
         text.append(text_of("lattice-zone", name=wave_name(part["wave"]), at=at, **part))
