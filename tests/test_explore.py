@@ -414,9 +414,9 @@ def test_no_panel_has_controls_beyond_its_edge(tab: Tab, content: Any, width: in
                     f" {residual}; return explorer.draw(); }}).then(() => 0)")  # fmt: skip
             assert (
                 tab.run(
-                    "explorer.panels.flatMap(p => [...p.element.querySelectorAll('*')].filter(e =>"
-                    " e.getBoundingClientRect().right > p.element.getBoundingClientRect().right + 0.5)"
-                    ".map(e => e.className))"
+                    "(right => explorer.panels.flatMap(p => [...p.element.querySelectorAll('*')]"
+                    ".filter(e => right(e) > right(p.element) + 0.5).map(e => e.className)))"
+                    "(e => e.getBoundingClientRect().right)"
                 )
                 == []
             )
