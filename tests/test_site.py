@@ -131,7 +131,7 @@ def test_equations_are_markup(site: Path) -> None:
         ("keys/virtual_experiment", ["fill_factor", "0 to 1", "1 to 16", "0 &lt; … &lt; 1.9"]),
         ("keys/photographs", ["formulation", "v0_degree", "mm/px"]),
         ("command_line", ["modeharvest benchmark make", "--whole-field", "TOML file"]),
-        ("api/modeharvest.idic", ["correlate", "Kinematics", "ImagePair"]),
+        ("api/modeharvest.idic", ["correlate", "Kinematics", "ImagePair", "[source]"]),
     ],
 )
 def test_references_are_drawn_from_the_code(site: Path, page: str, texts: list[str]) -> None:
