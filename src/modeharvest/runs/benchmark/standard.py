@@ -34,7 +34,7 @@ from modeharvest.validation.scoring.benchmark import SOLUTION, Declared
 from modeharvest.validation.scoring.score import ENOUGH_COVERED
 
 FORMAT, TRUTH = "modeharvest-standard-1", "standard.json"
-_FEW = 3
+_REASONS = 3
 """How many reasons are named if nothing could be graded."""
 
 
@@ -138,8 +138,8 @@ def leaderboard(
     if not rows:
         raise InputError(
             f"expected files CODE/CASE.csv in {handed_in}, got none to grade"
-            + "".join(f"; {why}" for why in [*refused.values()][:_FEW])
-            + f"; and {len(refused) - _FEW} more" * (len(refused) > _FEW)
+            + "".join(f"; {why}" for why in [*refused.values()][:_REASONS])
+            + f"; and {len(refused) - _REASONS} more" * (len(refused) > _REASONS)
         )
     board = {"set": known["id"], "title": known["title"], "codes": rows, "refused": refused}
     columns = ["code", "cases that count", "geometric mean of rms [px]", *known["cases"]]
