@@ -120,6 +120,7 @@ def test_the_tour_suits_the_lattice_and_its_load() -> None:
         ('[lattice]\nkind = "hexagonal"\nmesh_size = 0.0', "mesh_size [mm] above 0, got 0.0"),
         ('[lattice]\nkind = "hexachiral"\nring_radus = 1.0', "did you mean 'ring_radius'?"),
         ('[lattice]\nkind = "hexachiral"\nring_radius = -1.0', "ring_radius [mm] above 0"),
+        ('[lattice]\nkind = "tetrachiral"\nhandedness = "left"', "'clockwise'"),
         ('[lattice]\nkind = "file"\npath = "a.msh"\npitch = 0.0', "pitch [mm] above 0"),
         ('[lattice]\nkind = "file"\npath = "a.msh"', "pitch"),
         ("latice = 1", "did you mean 'lattice'?"),

@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 from pydantic import model_validator
@@ -119,7 +119,7 @@ class ChiralLattice:
     ring_thickness: float | None = None
     ligament_thickness: float | None = None
     """Dimensions [mm]; by default those of ``fem.lattice.cells.chiral``."""
-    handedness: str = "clockwise"
+    handedness: Literal["clockwise", "counterclockwise"] = "clockwise"
     """Either "clockwise" or "counterclockwise"."""
     ligaments = 4
     symmetry = "square"
