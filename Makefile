@@ -38,6 +38,9 @@ lint: ## Check style, types and the direction of imports
 	$(ENV) mypy -p modeharvest
 	$(ENV) env MYPYPATH=src:benchmarks:tests mypy --cache-dir .mypy_cache/programs \
 	  $(LOOSE) benchmarks/*.py scripts/*.py
+	$(ENV) env MYPYPATH=src:examples mypy --cache-dir .mypy_cache/examples \
+	  --allow-untyped-defs --allow-incomplete-defs --allow-untyped-calls \
+	  examples/*.py examples/gallery/*.py
 	$(ENV) lint-imports
 
 test-next: ## Run the tests on the next dolfinx (Debian unstable, in a root of its own)

@@ -87,7 +87,6 @@ def speedup(guesses: int, pixel: float, folder: Path) -> None:
     from modeharvest.validation.studies.study import ImagePairSpec
 
     path, case = shipped_solution("paper-virtual"), StudyCase()
-    assert path is not None, "the case ships its solution"
     imaging = replace(case.imaging, pixel_size=pixel)
     spec = ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
     study = RobustnessStudy(initial_guesses=guesses, radii=(), strain_errors=())

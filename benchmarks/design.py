@@ -232,7 +232,6 @@ def main() -> None:
     if options.strains:
         other_strains(case)
         return
-    assert path is not None
     solution = Solution.read(path)
     every: dict[str, Any] = {}
     heads = [f"{p}, {what}" for p in PARTS for what in ("scatter", "reported")]

@@ -23,7 +23,6 @@ STRAIN = 0.128
 def main() -> None:
     """Print the table."""
     case, path = Case(), shipped_solution("paper-virtual")
-    assert path is not None
     ansatz = case.correlation.ansatz(case.experiment.specimen)
     start = ansatz.initial_guess(STRAIN, case.correlation.start_amplitude)
     with tempfile.TemporaryDirectory() as folder:

@@ -54,7 +54,6 @@ def photographed(
     """Make images with speckle ``size`` times as wide; a user's files in ``folder/experiment``."""
     case = Case.read("paper-virtual")
     speckle, shipped = case.imaging.speckle, shipped_solution("paper-virtual")
-    assert shipped
     fine = replace(
         speckle, standard_deviation=speckle.standard_deviation / size,
         blur_px=max(0.8, speckle.blur_px * size),

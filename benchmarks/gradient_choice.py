@@ -24,7 +24,6 @@ from modeharvest.idic.solver.pyramid import FULL, eroded
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import Case, shipped_solution
-from modeharvest.util.errors import InputError
 
 STRAIN, PIXEL = 0.128, 0.04
 NOISES = (0.0, 0.01, 0.02, 0.04, 0.08)
@@ -40,8 +39,6 @@ WEIGHTED = {
 def images(folder: Path) -> ImageSet:
     """Make the pair of images."""
     path = shipped_solution("paper-virtual")
-    if path is None:
-        raise InputError("expected the shipped solution of paper-virtual, found none")
     spec = replace(Case.read("paper-virtual").imaging, pixel_size=PIXEL)
     make_images(Solution.read(path), spec, folder, [STRAIN])
     return ImageSet.read(folder)

@@ -101,7 +101,6 @@ def growth(mesh: Mesh, u: FloatArray) -> None:
 
 def main() -> None:
     path = shipped_solution("paper-virtual")
-    assert path is not None, "the case ships its solution"
     solution = Solution.read(path)
     mesh, u = solution.mesh, solution.at(STRAIN).displacement
     if "--growth" not in sys.argv:

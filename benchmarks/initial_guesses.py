@@ -90,7 +90,6 @@ class Map:
 
     def __init__(self, pixel_size: float) -> None:
         case, path = Case(), shipped_solution("paper-virtual")
-        assert path is not None, "the case ships its solution"
         spec = replace(case.imaging, pixel_size=pixel_size)
         folder = FOLDER / f"images-{1000 * pixel_size:g}um"
         images = make_images(Solution.read(path), spec, folder, (STRAIN,))

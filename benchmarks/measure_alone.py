@@ -67,7 +67,6 @@ def specimen(
     sensor = spec.sensor if noise is None else replace(spec.sensor, read_noise=noise)
     imaging = {"pixel_size": 0.02, "distortion": None, "shape": None} | imaging
     spec = replace(spec, speckle=speckle, sensor=sensor, background=0.06, **imaging)
-    assert solution
     return imaged(Solution.read(solution), spec, folder, strain, light)
 
 

@@ -23,10 +23,12 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "mathml",
     "docstrings",
+    "long_cells",
     "api_pages",
     "cli_pages",
     "key_pages",
@@ -46,6 +48,7 @@ myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
+viewcode_follow_imported_members = False
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True

@@ -16,6 +16,7 @@ from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.options import MacroLoading, equibiaxial, uniaxial
 from modeharvest.fem.materials import TwoTermI1
+from modeharvest.util.arrays import FloatArray
 
 FACTORS = (1.05, 1.2, 1.5)
 
@@ -40,7 +41,7 @@ def show(
         print(f"  {found.outcome}; root law {exponent(found.curve):.3f}")
 
 
-def exponent(curve: np.ndarray) -> float:
+def exponent(curve: FloatArray) -> float:
     """Exponent of e - e_c in the initial growth of the amplitude [-]: 1/2 at a pitchfork."""
     excess = np.abs(curve[1:3, 1] - curve[0, 1])
     return float(np.diff(np.log(curve[1:3, 0]))[0] / np.diff(np.log(excess))[0])

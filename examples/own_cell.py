@@ -58,7 +58,7 @@ def make_cell(path: Path) -> None:
             box = gmsh.model.getBoundingBox(1, curve)
             if box[3 + axis] - box[axis] < 1e-6:
                 sides[box[axis] > size / 2] = curve
-        shift = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+        shift = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
         shift[3 + 4 * axis] = size
         gmsh.model.mesh.setPeriodic(1, [sides[True]], [sides[False]], shift)
     gmsh.model.mesh.generate(2)

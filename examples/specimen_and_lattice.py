@@ -29,7 +29,7 @@ def main() -> None:
     at = u[tree.query(corners)[1]]
     mean = np.stack([at[1] - at[0], at[2] - at[0]], axis=1) / (2 * PITCH)
 
-    (xx, xy), (yx, yy) = mean.tolist()
+    xx, xy, yx, yy = map(float, mean.flat)
     loading, cell = MacroLoading(((xx, xy), (yx, yy))), square(PITCH, DIAMETER, SIZE)
     primitive = PeriodicCell(cell, material)
     critical = critical_at(CellPath(primitive, loading), (math.pi, math.pi), CriticalSearch(1.0))

@@ -68,7 +68,7 @@ class Experiment:
     path: PathOptions = field(default_factory=PathOptions)
     """How the equilibrium path is followed."""
     tilt: float = 0.0
-    """Rotation of the loaded edge at x > 0 per nominal strain [rad], counter-clockwise about its
+    """Rotation of the loaded edge at x > 0 [rad per nominal strain], counter-clockwise about its
     middle: at the strain e, -e tilt y is added to its u_x. This models a stage that is not quite
     parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed."""
     guided: bool = False

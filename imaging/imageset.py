@@ -40,7 +40,7 @@ from modeharvest.imaging.camera import Camera, ImageRecord
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, locate
-from modeharvest.imaging.pair import ImagePair, Truth
+from modeharvest.imaging.pair import KnownPair, Truth
 from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.imaging.render import ImagedState, render_deformed, render_reference
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
@@ -162,13 +162,13 @@ class ImageSet:
         """(rows, cols) True where the deformed image shows material."""
         return read_mask(self._whole(self._snapshot(strain).mask))
 
-    def pair(self, strain: float, *, camera: bool = False) -> ImagePair:
+    def pair(self, strain: float, *, camera: bool = False) -> KnownPair:
         """The reference and the deformed image at a nominal strain [-]; ``camera``: as exposed."""
         f, g = self.reference(camera=camera), self.deformed(strain, camera=camera)
         masks = self.mask(), self.deformed_mask(strain)
-        return ImagePair(f, g, self.grid, *masks, self.truth(strain), strain)
+        return KnownPair(f, g, self.grid, *masks, self.truth(strain), strain)
 
-    def __iter__(self) -> Iterator[ImagePair]:
+    def __iter__(self) -> Iterator[KnownPair]:
         """The noise-free image pairs of the set, each read when it is reached."""
         return map(self.pair, self.strains)
 

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -166,7 +166,7 @@ class ImagePair:
         everywhere, f, g = np.ones(self.grid.shape, np.bool_), self.mask, self.deformed_mask
         return everywhere if f is None else f, everywhere if g is None else g
 
-    def with_images(self, reference: NDArray[Any], deformed: NDArray[Any]) -> ImagePair:
+    def with_images(self, reference: NDArray[Any], deformed: NDArray[Any]) -> Self:
         """The same pair with other grey levels, for example noisy or blurred ones."""
         return replace(self, reference=reference, deformed=deformed)
 
@@ -176,6 +176,15 @@ class ImagePair:
             raise InputError("expected a pair whose true displacement is known, got one without")
         error = self.truth.displacement - measured.displacement(self.grid)
         return float(np.sqrt(np.mean(grey_levels_in(error, self.mask) ** 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPair(ImagePair):
+    """A pair of rendered images: the masks and the exact fields are known."""
+
+    mask: BoolArray
+    deformed_mask: BoolArray
+    truth: Truth
 
 
 def grey_levels_in(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:

@@ -16,6 +16,7 @@ from modeharvest.runs.case import (
     case_text,
     read_tables,
     shipped_cases,
+    shipped_solution,
     table_of_kind,
 )
 from modeharvest.runs.lattice.case import LatticeCase
@@ -28,6 +29,12 @@ def written(folder: Path, text: str) -> Path:
     path = folder / "case.toml"
     path.write_text(text, "utf-8")
     return path
+
+
+def test_a_solution_that_is_not_shipped_is_refused_with_those_that_are() -> None:
+    assert shipped_solution("paper-virtual").is_file()
+    with pytest.raises(InputError, match=r"among \['paper-real-twin', 'paper-virtual'\], got mine"):
+        shipped_solution("mine")
 
 
 def test_shipped_paper_case_spells_out_the_defaults() -> None:

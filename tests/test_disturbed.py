@@ -83,7 +83,6 @@ def write_case(folder: Path) -> None:
 
 def write_photographs(folder: Path) -> None:
     path = shipped_solution("paper-virtual")
-    assert path is not None
     spec = ImagingSpec(pixel_size=0.06, background=0.1, sensor=Sensor(read_noise=0.01))
     made = make_images(Solution.read(path), spec, folder / "made", (0.128,))
     shutil.copy(made.folder / "reference_8bit.tif", folder / "reference.tif")
@@ -93,7 +92,6 @@ def write_photographs(folder: Path) -> None:
 
 def write_study(folder: Path) -> None:
     path = shipped_solution("paper-virtual")
-    assert path is not None
     shutil.copy(path, folder / "given.h5")
     (folder / "study.toml").write_text(STUDY, "utf-8")
 

@@ -401,3 +401,24 @@ def test_it_fits_a_telephone(tab: Tab) -> None:
         assert 250 < width <= 420
     finally:
         tab.resize(1280, 900)
+
+
+@pytest.mark.parametrize("width", [420, 800, 1100, 1200, 1280])
+def test_no_panel_has_controls_beyond_its_edge(tab: Tab, content: Any, width: int) -> None:
+    """Not even with the longest unit; where three panels just fit beside each other, they did."""
+    residual = [quantity["key"] for quantity in content["quantities"]].index("residual")
+    tab.resize(width, 900)
+    try:
+        for count in (1, 3, 4):
+            tab.run(f"explorer.arrange({count}).then(() => {{ explorer.panels[0].quantity ="
+                    f" {residual}; return explorer.draw(); }}).then(() => 0)")  # fmt: skip
+            assert (
+                tab.run(
+                    "(right => explorer.panels.flatMap(p => [...p.element.querySelectorAll('*')]"
+                    ".filter(e => right(e) > right(p.element) + 0.5).map(e => e.className)))"
+                    "(e => e.getBoundingClientRect().right)"
+                )
+                == []
+            )
+    finally:
+        tab.resize(1280, 900)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from modeharvest.fem import materials
+from modeharvest.fem import materials, specimen
+from modeharvest.idic import modes
 from modeharvest.util.typed import quantities
 
 PAGE = Path(__file__).parents[1] / "docs/how-to/extending.md"
@@ -62,3 +63,16 @@ def test_a_noise_of_the_sensor() -> None:
     assert np.array_equal(camera.expose(light, 16, "one") / (2**16 - 1), grey)
     assert not np.array_equal(camera.expose(light, 16, "two") / (2**16 - 1), grey)
     assert grey.var() > 1.5 * float(made(full_well=5000.0, gain=0.8).noise_variance(0.4, 16))
+
+
+def test_a_hole_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(specimen, "STACKINGS", dict(specimen.STACKINGS))
+    monkeypatch.setattr(modes, "FAMILIES", dict(modes.FAMILIES))
+    made = run("A hole lattice of specimens")["specimen"]
+    assert made.vectors[1] == pytest.approx((0.95, 1.7))
+
+
+def test_every_recipe_is_run() -> None:
+    recipes = [part for part in PAGE.read_text("utf-8").split("\n## ")[1:] if "```python" in part]
+    tests = Path(__file__).read_text("utf-8")
+    assert [part for part in recipes if f'run("{part.splitlines()[0]}")' not in tests] == []

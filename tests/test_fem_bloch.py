@@ -315,7 +315,7 @@ def test_a_stable_lattice_is_an_outcome_not_a_failure() -> None:
     assert not found.found
     assert found.load == 0.01
     assert found.least_stable.value > 0
-    assert "stable up to 0.01" in found.outcome
+    assert "stable up to e = 0.01" in found.outcome
 
 
 class EndingPath(CellPath):
@@ -343,7 +343,7 @@ def test_a_path_that_ends_is_looked_at_up_to_there(end: float) -> None:
         assert 0.02 < whole.load < end
     else:
         assert found.load == end
-        assert "did not converge beyond 0.02" in found.outcome
+        assert "did not converge beyond e = 0.02" in found.outcome
         assert found.least_stable.value > 0
 
 

@@ -152,7 +152,7 @@ def test_a_branch_along_which_the_load_falls_is_followed() -> None:
     _, modes = start("pressed")
     found = branch("pressed", (1.0,), (0.998, 1.002))
     assert "the load falls" in found.outcome
-    assert f"not met: {1.002 * modes.load:.6g}" in found.outcome
+    assert f"not met: e = {1.002 * modes.load:.6g}" in found.outcome
     (state,) = found.states
     assert state.negative_eigenvalues == 1
     path, driven = start("thick")

@@ -18,7 +18,6 @@ FloatArray = NDArray[np.float64]
 def test_shipped_solution_of_the_paper_case_against_a_fresh_one() -> None:
     """Other versions of MUMPS and BLAS round differently; equilibrium is met to 1e-11 of strain."""
     path = shipped_solution("paper-virtual")
-    assert path is not None
     shipped, fresh = Solution.read(path), simulate(Case.read("paper-virtual").experiment)
     np.testing.assert_array_equal(shipped.mesh.cells, fresh.mesh.cells)
     np.testing.assert_allclose(shipped.mesh.nodes, fresh.mesh.nodes, rtol=0, atol=1e-12)
@@ -36,7 +35,6 @@ def test_shipped_solution_of_the_paper_case_against_a_fresh_one() -> None:
 def test_shipped_twin_is_in_stable_equilibrium_under_its_tilted_and_guided_loading() -> None:
     """Without walking its path again: residual and inertia at what is shipped."""
     case, path = Case.read("paper-real-twin"), shipped_solution("paper-real-twin")
-    assert path is not None
     shipped, experiment = Solution.read(path), case.experiment
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)

@@ -62,11 +62,15 @@ def test_doctor_says_what_is_missing_and_how_to_get_it(
 def test_doctor_names_a_cache_that_is_there_and_how_to_remove_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    (tmp_path / "modeharvest").mkdir()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    """The command removes that folder only, whatever its name."""
+    cache = tmp_path / "my cache"
+    (cache / "modeharvest").mkdir(parents=True)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache / "numba"))
     rows = {name: (value, remark) for name, value, remark in doctor.caches()}
-    assert rows["scripts/env"][0] == str(tmp_path / "modeharvest")
-    assert f"rm -r {tmp_path / 'modeharvest'}" in rows["scripts/env"][1]
+    assert rows["scripts/env"][0] == str(cache / "modeharvest")
+    assert rows["scripts/env"][1].endswith(f"rm -r '{cache / 'modeharvest'}'")
+    assert f"find -L '{cache / 'numba'}' -name" in rows["kernels"][1]
     assert "dolfinx" not in rows
 
 

@@ -47,7 +47,6 @@ cell_size = 1.9
 def images(tmp_path_factory: pytest.TempPathFactory) -> ImageSet:
     """The paper's specimen before and after buckling, by a noisy camera."""
     path = shipped_solution("paper-virtual")
-    assert path is not None
     spec = ImagingSpec(pixel_size=PIXEL, background=0.1, sensor=Sensor(read_noise=NOISE))
     folder = tmp_path_factory.mktemp("images")
     return make_images(Solution.read(path), spec, folder, (0.078, 0.128))

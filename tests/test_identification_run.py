@@ -457,6 +457,7 @@ def test_the_shipped_case_is_one() -> None:
         ({"unknowns": {"v0[0].z[0,0]": {"start": 0.0, "bounds": [-0.1, 0.1]}}},
          "'v0[k].x[i,j]'"),
         ({"twin": {"values": {"bow": 0.1}}}, "got 'bow'"),
+        ({"twin": {"force_seed": -1}}, "twin: expected a force_seed of 0 or more, got -1"),
         ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, "distortion": "lens.json"}},
          "expected images for the distortion of a lens, got fields"),
         ({"data": {"reference": "f.tif", "deformed": ["g.tif", "h.tif"], "pixel_size": 0.1,

@@ -1,13 +1,16 @@
 """Guards a pair of images: what is refused, and the error against the truth."""
 
 from dataclasses import dataclass
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.pair import ImagePair, Truth
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.pair import ImagePair, KnownPair, Truth
+from modeharvest.util.arrays import BoolArray
 from modeharvest.util.errors import InputError
 
 GRID = PixelGrid.centred(12, 10, 0.1)
@@ -35,6 +38,13 @@ def test_images_are_kept_as_read_only_float32() -> None:
     np.testing.assert_array_equal(other.deformed, F + np.float32(0.5))
     assert other.mask is not None
     assert other.grid == GRID
+
+
+def test_type_checkers_know_that_rendered_pairs_have_masks_and_a_truth() -> None:
+    assert get_type_hints(ImageSet.pair)["return"] is KnownPair
+    known = get_type_hints(KnownPair)
+    assert known["truth"] is Truth
+    assert known["mask"] == known["deformed_mask"] == BoolArray
 
 
 @pytest.mark.parametrize(

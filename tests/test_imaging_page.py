@@ -22,7 +22,7 @@ def test_the_printed_example_predicts_its_noise(tmp_path: Path) -> None:
 
 
 def test_the_printed_options_are_all_there_are(tmp_path: Path) -> None:
-    (block,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    block, _ = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     path = tmp_path / "case.toml"
     path.write_text(block, "utf-8")
     sensor = Case.read(path).imaging.sensor

@@ -155,3 +155,14 @@ def test_without_points_there_is_no_dispersion(tmp_path: Path) -> None:
     assert 0 < summary["critical"]["error"] < 0.2 * summary["critical"]["load"]
     assert summary["critical"]["order"] == 2.0
     assert "elements across the ligament" in summary["notes"][0]
+
+
+def test_a_text_of_an_analysis_has_its_loads_with_units() -> None:
+    outcome = "the load falls from e = 0.0963 on; followed to e = 1.2e-05; not met: e = 0.2, e = 1"
+    assert LoadQuantity().in_units(outcome) == (
+        "the load falls from 9.63 % on; followed to 0.0012 %; not met: 20 %, 100 %"
+    )
+    assert LoadQuantity("stress", "MPa", 0.5).in_units("stable up to e = 0.2, the") == (
+        "stable up to 0.1 MPa, the"
+    )
+    assert LoadQuantity("load factor", "", 1.0).in_units("at e = 0.2 for") == "at e = 0.2 for"

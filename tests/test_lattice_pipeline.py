@@ -230,7 +230,7 @@ def coarse(**changes: Any) -> LatticeCase:
 def test_a_lattice_that_never_buckles_is_an_outcome(tmp_path: Path) -> None:
     case = coarse(search=CriticalSearch(largest=0.005, divisions=2))
     summary = run(case, tmp_path)
-    assert "stable up to 0.005" in summary["outcome"]
+    assert "stable up to e = 0.005" in summary["outcome"]
     assert not summary["critical"]["found"]
     assert summary["critical"]["value"] > 0  # how far it still was from zero
     assert summary["modes"] is None

@@ -105,10 +105,11 @@ def test_what_a_run_does_not_have_is_left_out(tmp_path: Path) -> None:
 
 
 def test_a_lattice_that_stays_stable_is_an_outcome(tmp_path: Path) -> None:
-    point = CriticalPoint("uniaxial", 0.28, False, "stable up to 0.28", value=0.3)
+    point = CriticalPoint("uniaxial", 0.28, False, "stable up to e = 0.28", value=0.3)
     run = made_up.run(critical=point, modes=None, branches=(), patterns=())
     text = page(run, tmp_path)
     assert "stable so far" in text
+    assert "stable up to 28\N{NO-BREAK SPACE}%" in text
     assert "critical wave</dt>" not in text
     assert "lowest filling · λ/k² is 0.3 MPa, above zero" in text
     assert "no critical point was found up to 28\N{NO-BREAK SPACE}%" in text

@@ -117,7 +117,6 @@ def test_the_lattice_s_mode_lies_on_the_specimen_s_holes() -> None:
 def spec() -> ImagePairSpec:
     """The paper's specimen on images of 0.05 mm/px, which take a tenth of a second."""
     case = StudyCase()
-    assert PAPER is not None
     imaging = replace(case.imaging, pixel_size=0.05)
     return ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
 

@@ -19,7 +19,7 @@ DRAWING = {"matplotlib", "jinja2", "typer"}  # rich comes with meshio
 EXPERIMENTS = ("Experiment", "Ogden", "Specimen")
 MEASURED = (
     "Ansatz", "ImagePair", "ImagingSpec", "Result", "Solution", "best_fit", "correlate",
-    "harvest", "make_images", "run", "score",
+    "harvest", "make_images", "run", "score", "shipped_solution",
 )  # fmt: skip
 
 

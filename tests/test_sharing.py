@@ -83,6 +83,18 @@ def test_a_crate_says_all_that_an_archive_asks_for(
     assert set(pointed) - {"https://w3id.org/ro/crate/1.1"} <= set(found)
 
 
+def test_a_study_s_columns_have_units_and_a_run_its_command(folder: Path) -> None:
+    (folder / "table.csv").write_text("seed,w_px,curvature_sd_mm\n1,2,3\n")
+    run = {key: value for key, value in SUMMARY.items() if key != "command"} | {"snapshots": []}
+    write_json(folder / "summary.json", run)
+    found = entities(write_crate(folder))
+    measured = [found[of["@id"]] for of in found["./"]["variableMeasured"]]
+    assert [(m["name"], m["unitText"]) for m in measured[2:]] == [
+        ("w_px", "px"), ("curvature_sd_mm", "mm")
+    ]  # fmt: skip
+    assert found["#made"]["name"].startswith("modeharvest run CASE.toml --out DIR, ")
+
+
 def values_of(entity: dict[str, Any]) -> list[dict[str, str]]:
     each = [v if isinstance(v, list) else [v] for v in entity.values()]
     return [value for values in each for value in values if isinstance(value, dict)]
@@ -220,11 +232,18 @@ def test_codes_are_ranked_over_the_cases(benchmark: tuple[Path, Path], tmp_path:
     hand_in("coarse", "second", 0.2)
     hand_in("half", "first", 0.001)
     (codes / "half" / "second.csv").write_text("nothing\n")
+    (codes / "half" / "secnd.csv").write_text("nothing\n")
+    (codes / "half" / "README.txt").write_text("no field\n")
     board = leaderboard(codes, truth, tmp_path / "out")
     assert [row["code"] for row in board["codes"]] == ["fine", "coarse", "half"]
     assert [row["counted"] for row in board["codes"]] == [2, 2, 1]
     assert board["codes"][0]["rms_px"] == pytest.approx(0.04, rel=0.1)  # the root of 0.02 * 0.08
-    assert list(board["refused"]) == [str(codes / "half" / "second.csv")]
+    assert list(board["refused"]) == [str(codes / "half" / f"{n}.csv") for n in ("secnd", "second")]
+    assert "one of the cases first, second" in board["refused"][str(codes / "half" / "secnd.csv")]
+    command = ("benchmark", "leaderboard", codes, "--truth", truth, "--out", tmp_path / "again")
+    done = CliRunner().invoke(app, list(map(str, command)))
+    assert done.exit_code == 2
+    assert done.output.count("error: ") == 2
     text = (tmp_path / "out" / "report.html").read_text("utf-8")
     page = Page(text)
     assert {"first/report.html", "second/report.html"} <= set(page.links)
@@ -236,3 +255,13 @@ def test_an_empty_folder_of_codes_is_refused(tmp_path: Path) -> None:
     write_json(tmp_path / TRUTH, {"format": FORMAT, "cases": {}, "id": "a", "title": "t"})
     with pytest.raises(InputError, match=r"expected files CODE/CASE\.csv"):
         leaderboard(tmp_path / "none", tmp_path, tmp_path / "out")
+
+
+def test_of_many_unusable_files_a_few_are_named(tmp_path: Path) -> None:
+    cases = {name: {} for name in "abcde"}
+    write_json(tmp_path / TRUTH, {"format": FORMAT, "cases": cases, "id": "a", "title": "t"})
+    (tmp_path / "codes" / "mine").mkdir(parents=True)
+    for n in range(5):
+        (tmp_path / "codes" / "mine" / f"{n}.csv").write_text("nothing\n")
+    with pytest.raises(InputError, match=r"mine/2\.csv: [^;]*; and 2 more$"):
+        leaderboard(tmp_path / "codes", tmp_path, tmp_path / "out")

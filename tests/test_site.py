@@ -7,12 +7,15 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from dataclasses import fields
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
+
+from modeharvest.runs.case import table_of_kind
 
 ROOT = Path(__file__).parents[1]
 NO_NETWORK = dict.fromkeys(
@@ -128,7 +131,7 @@ def test_equations_are_markup(site: Path) -> None:
         ("keys/virtual_experiment", ["fill_factor", "0 to 1", "1 to 16", "0 &lt; … &lt; 1.9"]),
         ("keys/photographs", ["formulation", "v0_degree", "mm/px"]),
         ("command_line", ["modeharvest benchmark make", "--whole-field", "TOML file"]),
-        ("api/modeharvest.idic", ["correlate", "Kinematics", "ImagePair"]),
+        ("api/modeharvest.idic", ["correlate", "Kinematics", "ImagePair", "[source]"]),
     ],
 )
 def test_references_are_drawn_from_the_code(site: Path, page: str, texts: list[str]) -> None:
@@ -157,6 +160,41 @@ def test_every_key_has_a_meaning_of_its_own(monkeypatch: pytest.MonkeyPatch) -> 
     named = {base.__name__: base for _, cls in tables for base in cls.__mro__}
     for name, own in key_pages.MEANINGS.items():
         assert own.keys() <= {f.name for f in fields(named[name])}, name
+
+
+UNITLESS = {"", "-", "–", "fraction of full scale"}
+
+
+@pytest.mark.dolfinx
+def test_the_reference_has_the_keys_of_shipped_cases_with_their_units(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Keys in comments are options; a comment says a number's unit in brackets at its end."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs/_ext"))
+    import key_pages
+
+    compared = 0
+    for case in sorted((ROOT / "src/modeharvest/cases").rglob("*.toml")):
+        text = case.read_text("utf-8")
+        kind = table_of_kind(tomllib.loads(text))
+        (model,) = (m for _, m, _ in key_pages.CASES.values() if m.table == kind)
+        known = {
+            (path, row[0].strip("`")): row for path, cls in key_pages.tables(model)
+            for row in key_pages.keys(cls, path)
+        }  # fmt: skip
+        table = ""
+        for line in text.splitlines():
+            if head := re.match(r"(?:# )?\[+([\w.]+)\]+ *(#|$)", line):
+                table = head[1]
+            elif (key := re.match(r"(?:# )?(\w+) = [^#]*# (.*)", line)) and key[1] != "kind":
+                if table in ("", "unknowns"):  # names of parameters
+                    continue
+                _, what, unit, *_ = known[table, key[1]]
+                stated = re.findall(r"\[([^\]\d\"'=,]{1,40})\]", key[2])
+                if stated and "number" in what and unit != "``unit``":
+                    assert unit == stated[-1] or {unit, stated[-1]} <= UNITLESS, (case, line)
+                    compared += 1
+    assert compared > 100
 
 
 @pytest.mark.dolfinx

@@ -24,7 +24,14 @@ import modeharvest
 from modeharvest.cli.root import main
 from modeharvest.util import stages
 from modeharvest.util.errors import InputError, WriteError
-from modeharvest.util.stages import StagedRun, Stages, exclusive, source_digest, stage_key
+from modeharvest.util.stages import (
+    StagedRun,
+    Stages,
+    command_line,
+    exclusive,
+    source_digest,
+    stage_key,
+)
 
 
 class Work:
@@ -377,3 +384,8 @@ def test_under_mpirun_one_rank_holds_for_all_and_all_are_refused(tmp_path: Path)
     assert counted("had it") == 2
     with locked_elsewhere(tmp_path):
         assert counted("refused") == 2
+
+
+def test_a_command_can_be_typed_again_whatever_its_files_are_called() -> None:
+    line = command_line("harvest", Path("my test.toml"), "--out", "out/a b")
+    assert line == "modeharvest harvest 'my test.toml' --out 'out/a b'"

@@ -62,7 +62,6 @@ pixel_size = 0.05
 def spec() -> ImagePairSpec:
     """The paper's specimen on images of 0.05 mm/px, which take a tenth of a second."""
     case = StudyCase()
-    assert PAPER is not None
     imaging = replace(case.imaging, pixel_size=0.05)
     return ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
 
@@ -386,7 +385,6 @@ def test_a_solution_of_another_experiment_is_not_taken(spec: ImagePairSpec, tmp_
 def test_a_study_from_the_command_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert PAPER is not None
     case, out = tmp_path / "tiny.toml", tmp_path / "out"
     case.write_text(TINY, "utf-8")
     arguments = ("study", case, "--out", out, "--solution", PAPER, "--workers", "1")
@@ -443,7 +441,6 @@ def test_a_case_has_one_thread(tmp_path: Path) -> None:
 
 def test_failures_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder in which one of two starts failed, and none is left to be run."""
-    assert PAPER is not None
     case = StudyCase(study=RobustnessStudy(initial_guesses=2, radii=(), strain_errors=()))
     case = StudyCase(study=case.study, imaging=replace(case.imaging, pixel_size=0.05))
     pipeline = StudyAnalysis(case, tmp_path, solution=PAPER)

@@ -140,7 +140,6 @@ def test_without_a_lens_there_is_nothing_to_calibrate(tmp_path: Path) -> None:
 
 def shipped() -> tuple[Case, Solution]:
     case, path = Case.read("paper-real-twin"), shipped_solution("paper-real-twin")
-    assert path is not None
     assert path.stat().st_size < 5e6
     return case, Solution.read(path)
 

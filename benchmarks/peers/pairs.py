@@ -139,7 +139,6 @@ def _came_from(ansatz: Ansatz, a: FloatArray, grid: PixelGrid) -> FloatArray:
 def paper(shape: tuple[int, int] | None, pixel_size: float) -> ImagePair:
     """Make float images of the paper's virtual experiment after buckling, as in its case."""
     case, path = Case(), shipped_solution("paper-virtual")
-    assert path is not None, "the case ships its solution"
     solution = Solution.read(path)
     specimen = case.experiment.specimen
     spec = replace(case.imaging, shape=shape, pixel_size=pixel_size)

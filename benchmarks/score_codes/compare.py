@@ -6,10 +6,12 @@ Run: benchmarks/score_codes/run [--specimen paper|plate] [--pixel-size 0.02] [--
 Each code gets the public folder: 8-bit images, mask, benchmark.json (IDIC also uses the paper's
 lattice). It returns a file in a public format, and 'modeharvest score' grades the files. All files
 and the report are in out/score_codes. Specimens: the paper's, with 60 holes, and a plate with one.
+With all codes, at that pixel size, the specimen's table in docs/how-to/scoring.md is written.
 
 --standard: instead, the cases of a set that 'modeharvest benchmark standard --out DIR' made, and
-their leaderboard; existing fields are kept, so that a run can be interrupted. With all codes and
-cases the table in docs/how-to/scoring.md is written, with --table that of the existing fields.
+their leaderboard; existing fields are kept, so that a run can be interrupted. With all cases its
+table in docs/how-to/scoring.md is written; columns of codes without any field are kept there, if
+the set is the same. --table: only grade the existing fields, and write that table.
 """
 
 from __future__ import annotations
@@ -55,9 +57,12 @@ HERE = Path(__file__).resolve().parent
 PAGE = HERE.parents[1] / "docs/how-to/scoring.md"
 sys.path.append(str(HERE.parent / "peers"))
 import document  # noqa: E402
+import tables  # noqa: E402
 
 OUT = HERE.parents[1] / "out" / "score_codes"
 SUBSET_PX, STEP_PX = 21, 5
+PIXEL_SIZE = 0.02
+"""Pixel size of the comparison in docs/how-to/scoring.md [mm]."""
 TIMEOUT_S = 600.0
 """Time limit, far longer than any code takes; for those that hang."""
 
@@ -206,7 +211,7 @@ def standard(public: Path, arguments: argparse.Namespace) -> None:
     wanted = () if arguments.table else arguments.cases or cases
     for case, code in product(wanted, arguments.only or CODES):
         field = handed_in / code / f"{case}.csv"
-        if field.exists() or (CODES[code] in (idic, whole) and case in OTHER_SPECIMENS):
+        if field.exists() or is_skipped(code, case):
             continue
         begin = time.perf_counter()
         try:
@@ -221,30 +226,14 @@ def standard(public: Path, arguments: argparse.Namespace) -> None:
     for row in board["codes"]:
         rms = {case: round(numbers["rms_px"], 4) for case, numbers in row["cases"].items()}
         print(f"{row['code']}: {row['rms_px']:.3g} px over {row['counted']} cases: {rms}")
-    if arguments.table or not (arguments.cases or arguments.only):
-        document.write(PAGE, {"standard": standard_table(board, cases)})
+    if not arguments.cases:
+        earlier = tables.lines_of(PAGE, "standard")
+        document.write(PAGE, {"standard": tables.standard(board, cases, is_skipped, earlier)})
 
 
-def standard_table(board: dict[str, Any], cases: dict[str, Any]) -> list[str]:
-    """Rms errors [px] as Markdown, with the share of the material that is covered if not all is."""
-    rows = board["codes"]
-    lines = [f"| rms [px], set {board['set']} | " + " | ".join(r["code"] for r in rows) + " |"]
-    lines.append("|---" * (len(rows) + 1) + "|")
-    for case in (c for c in cases if any(c in row["cases"] for row in rows)):
-        cells = []
-        for row in rows:
-            found, missing = row["cases"].get(case), "none"
-            if CODES[row["code"]] in (idic, whole) and case in OTHER_SPECIMENS:
-                missing = "–"
-            share = 100 * found["covered"] if found else 100.0
-            part = f" ({share:.0f} %)" if share < 99.5 else ""
-            cells.append(f"{found['rms_px']:.2g}{part}" if found else missing)
-        lines.append(f"| {case} | " + " | ".join(cells) + " |")
-    lines.append("| cases that count | " + " | ".join(str(r["counted"]) for r in rows) + " |")
-    means = " | ".join(f"{r['rms_px']:.2g}" for r in rows)
-    lines.append(f"| geometric mean over them | {means} |")
-    left = [case for case in cases if not any(case in row["cases"] for row in rows)]
-    return [*lines, "", f"Not measured yet: {', '.join(left)}."] if left else lines
+def is_skipped(code: str, case: str) -> bool:
+    """Whether a code starts from the paper's lattice, and the case has another one."""
+    return CODES[code] in (idic, whole) and case in OTHER_SPECIMENS
 
 
 def main() -> None:
@@ -279,6 +268,8 @@ def main() -> None:
     graded = out / "graded"
     done = score(fields, truth_folder(public), task.strain, graded)
     print_report(grading_report(done), graded)
+    if not (arguments.only or arguments.strain) and arguments.pixel_size == PIXEL_SIZE:
+        document.write(PAGE, {arguments.specimen: tables.comparison(done)})
 
 
 def _arguments() -> argparse.Namespace:
@@ -287,7 +278,7 @@ def _arguments() -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--specimen", choices=list(SPECIMENS), default="paper")
-    parser.add_argument("--pixel-size", type=float, default=0.02, help="[mm/px]")
+    parser.add_argument("--pixel-size", type=float, default=PIXEL_SIZE, help="[mm/px]")
     parser.add_argument("--strain", type=float, help="of the paper's: 0.078 or 0.128")
     parser.add_argument("--only", nargs="+", choices=list(CODES), help="only these codes")
     parser.add_argument("--standard", type=Path, metavar="DIR", help="a standard set's folder")

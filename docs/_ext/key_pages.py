@@ -23,6 +23,7 @@ from rst import FOLDER, heading, table, write
 from sphinx.application import Sphinx
 
 from modeharvest.fem.materials import MATERIALS
+from modeharvest.idic.finite_element.identification.identify import Unknown
 from modeharvest.idic.photograph.geometry import SpecimenTable
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.runs.case import Case, CaseModel
@@ -55,6 +56,8 @@ EXAMPLES: dict[type[Any], dict[str, Any]] = {
     FileLattice: {"path": "cell.msh", "pitch": 1.9},
     FileMode: {"path": "modes.h5"},
     LogTable: {"file": "log.csv"},
+    CameraDistortion: {"fx": 2000.0, "fy": 2000.0, "cx": 500.0, "cy": 500.0},
+    Unknown: {"start": 1.0, "bounds": (0.5, 2.0)},
     MeasuredData: {"reference": "reference.tif", "deformed": ("f.tif",), "pixel_size": 0.01},
 }
 """Example values of the keys that have no default, by class."""
@@ -131,12 +134,19 @@ def plain_type(hint: Any) -> str:
         return " or ".join(dict.fromkeys(plain_type(k) for k in inner if k is not type(None)))
     if origin in (tuple, list) or hint in (tuple, list):
         own = [plain_type(k) for k in inner if k is not Ellipsis]
-        many = "" if len(set(own)) != 1 else f" of {own[0].replace('number', 'numbers')}"
-        return f"list{many}" if Ellipsis in inner else f"list of {len(own)}{many[3:] and ''}"
+        count = "" if Ellipsis in inner or not own else f" {len(own)}"
+        many = f" {plural(own[0])}" if len(set(own)) == 1 else ""
+        return f"list of{count}{many}" if count or many else "list"
     if origin is dict:
         return "table"
     names = {bool: "true or false", int: "whole number", float: "number", str: "text"}
     return names.get(hint, "table")
+
+
+def plural(kind: str) -> str:
+    """The name of a TOML type for several values."""
+    word, of, rest = kind.partition(" of ")
+    return word + ("" if word == "text" else "s") + of + rest
 
 
 def literal(value: Any) -> str:
@@ -247,10 +257,15 @@ def sections(cls: type[Any], path: str) -> Iterator[tuple[str, type[Any], str]]:
 
 def below(name: str, hint: Any, path: str) -> Iterator[tuple[str, type[Any], str]]:
     """The tables of a key whose value is a table; none for other keys."""
-    if name in CHOICES and plain_type(hint) != "text":
+    cls = nested(hint)
+    if (
+        name in CHOICES
+        and plain_type(hint) != "text"
+        and (cls is None or get_origin(hint) is Annotated)
+    ):
         for kind, cls in CHOICES[name].items():
             yield path, cls, kind
-    elif (cls := nested(hint)) is not None and cls is not OtherLaw:
+    elif cls is not None and cls is not OtherLaw:
         yield from sections(cls, path)
 
 
@@ -270,7 +285,7 @@ def keys(cls: type[Any], path: str) -> Iterator[tuple[str, ...]]:
             default = f.default_factory()
         none = f.default is MISSING and f.default_factory is MISSING
         needed = none or (isinstance(default, float) and math.isnan(default))
-        shown = "required" if needed else "" if default is None else f"``{literal(default)}``"
+        shown = "required" if needed else "none" if default is None else f"``{literal(default)}``"
         text = about.get(f.name, "") or f.metadata.get("label", "")
         of = f.metadata.get("unit") or unit(f.name, text, kind)
         span = accepted(cls, f.name)
@@ -306,7 +321,7 @@ def page(title: str, model: type[CaseModel], command: str, others: dict[type[Any
         if not tables and name != "title":
             kind = plain_type(hint)
             about = docstrings(model).get(name, "")
-            default = "" if field.default in (None, ...) else f"``{field.default}``"
+            default = "none" if field.default is None else f"``{literal(field.default)}``"
             rows.append((f"``{name}``", kind, unit(name, about, kind), default, "", about))
         plain += tables
     text += table(HEAD, rows, "16 12 8 14 16 34")
@@ -315,7 +330,7 @@ def page(title: str, model: type[CaseModel], command: str, others: dict[type[Any
         if label in others:
             continue
         others[label] = title
-        head = f"[{path}]" + (f' with kind = "{kind}"' if kind else "")
+        head = f"[{path}]" + (f' with ``kind = "{kind}"``' if kind else "")
         text += f".. _{label}:\n\n" + heading(head, "-")
         summary = inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0]
         text += summary.replace("\n", " ") + "\n\n"

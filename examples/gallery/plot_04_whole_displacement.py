@@ -13,12 +13,13 @@ import numpy as np
 
 import modeharvest as mh
 from modeharvest.idic.finite_element.measure import measure_displacement
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.case import shipped_solution
 
 PIXEL = 0.04  # mm
 solution = mh.Solution.read(shipped_solution("paper-virtual"))
-speckle = {"standard_deviation": 0.08, "blur_px": 2.0}
-spec = mh.ImagingSpec(pixel_size=PIXEL, speckle=type(mh.ImagingSpec().speckle)(**speckle))
+speckle = SpeckleSpec(standard_deviation=0.08, blur_px=2.0)
+spec = mh.ImagingSpec(pixel_size=PIXEL, speckle=speckle)
 images = mh.make_images(solution, spec, tempfile.mkdtemp(), [0.128])
 pair = images.pair(0.128, camera=True)
 result = mh.correlate(pair, mh.Ansatz.square(solution.specimen))

@@ -49,7 +49,8 @@ mesh = meshio.read(folder / "out/results/deformed.vtu")
 E = np.asarray(mesh.point_data["green_lagrange"]).reshape(len(mesh.points), -1)[:, 0]
 finer = mesh.cells[0].data[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]]  # of quadratic ones
 fig, ax = plt.subplots(figsize=(7, 4.6), layout="constrained")
-shown = ax.tripcolor(*mesh.points[:, :2].T, finer.reshape(-1, 3), 100 * E, shading="gouraud")
+x, y, _ = mesh.points.T
+shown = ax.tripcolor(x, y, 100 * E, triangles=finer.reshape(-1, 3), shading="gouraud")
 ax.set_aspect("equal")
 ax.set(xlabel="x [px]", ylabel="y [px]", title="Green–Lagrange strain along x")
 fig.colorbar(shown, label="%")

@@ -18,8 +18,8 @@ from modeharvest.runs.case import shipped_solution
 solution = mh.Solution.read(shipped_solution("paper-virtual"))
 spec = mh.ImagingSpec(pixel_size=0.03, background=0.45)  # neither dark nor bright
 images = mh.make_images(solution, spec, tempfile.mkdtemp(), [0.078])
-photograph = images.reference(camera=True)
-photograph = photograph + 0.01 * np.random.default_rng(0).standard_normal(photograph.shape)
+exposed = images.reference(camera=True)
+photograph = exposed + 0.01 * np.random.default_rng(0).standard_normal(exposed.shape)
 
 found = find_material(photograph)
 wrong = np.mean(found.mask != images.mask())

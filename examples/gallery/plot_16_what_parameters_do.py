@@ -21,7 +21,7 @@ test = ParametricTest.meshed(experiment, names)
 values = test.own_values
 steps = [*0.01 * values[:3], 1e-4]
 before, after = test.at(values)
-print(f"the specimen buckles at {100 * test.critical_strain:.2f} %")
+print(f"the specimen buckles at a nominal strain of {test.critical_strain:.4f}")
 for name, step, by in zip(names, steps, after.force_by, strict=True):
     print(f"{name:13s} the force by {100 * step * by / after.force:+.2f} %")
 

@@ -211,12 +211,14 @@ class _LoadSearch:
             if least.value <= 0:
                 return self._root(load, target)
             if path_ends:
-                return self._stable(target, f"Newton's method did not converge beyond {target:.6g}")
+                return self._stable(
+                    target, f"Newton's method did not converge beyond e = {target:.6g}"
+                )
             rate = (previous.value - least.value) / (target - load)
             ahead = 1.05 * least.value / rate if rate > 0 else math.inf
             step = min(max(ahead, 0.2 * step), 3.0 * step, self.search.largest_step)
             load, previous = target, least
-        return self._stable(load, f"stable up to {load:.6g}, the largest load asked for")
+        return self._stable(load, f"stable up to e = {load:.6g}, the largest load asked for")
 
     def _at_rest(self) -> LeastStable:
         state = self.path.at(0.0)
@@ -250,7 +252,7 @@ class _LoadSearch:
         below, above = self._unstable(before, waves), self._unstable(after, waves)
         earlier = BlochWaves(self.path.cell, before).unstable_among(self.everywhere)
         kind = "long waves" if least.angle is not None else f"{len(waves)} wave vector(s)"
-        text = f"critical at {load:.6g} for {kind}"
+        text = f"critical at e = {load:.6g} for {kind}"
         text += f"; but {len(earlier)} others are unstable before" if earlier else ""
         text += self._where
         known = (waves, state, self._by_load(), below, above, split, bound, earlier)

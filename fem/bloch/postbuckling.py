@@ -106,13 +106,13 @@ class _Tracing:
                 by = f"{self.splitting:.1g} of the load"
                 why = f"the mesh splits these modes by {by}, so branches start along single ones: "
                 why += "for this one mesh one sector of the cell, and turn and mirror it"
-            return f"not followed from the load {start.load:.6g} on: {why}"
+            return f"not followed from e = {start.load:.6g} on: {why}"
         way = "rises" if self.points[1].load > start.load else "falls"
-        text = f"the load {way} from {start.load:.4g} on; followed to {last.load:.4g}, "
+        text = f"the load {way} from e = {start.load:.4g} on; followed to e = {last.load:.4g}, "
         text += f"amplitude {last.amplitude:.4g} mm"
         text += f"; {self.stopped}" if self.stopped else ""
         met = {state.load for state in states}
-        missing = ", ".join(f"{load:.6g}" for load in loads if load not in met)
+        missing = ", ".join(f"e = {load:.6g}" for load in loads if load not in met)
         return text + (f"; not met: {missing}" if missing else "")
 
     def _follow(self) -> Iterator[None]:
@@ -143,7 +143,7 @@ class _Tracing:
         """The critical point, extrapolated from a state with a regular tangent, and the mode."""
         load = self.modes.load
         if not self.primary.states:
-            self.stopped = f"no equilibrium of the primary path near the load {load:.6g}"
+            self.stopped = f"no equilibrium of the primary path near e = {load:.6g}"
             return None
         below, along = self.primary.states[0], self.mix != 0
         distances = self.cell.critical_distances(
@@ -151,7 +151,7 @@ class _Tracing:
         )
         if (farthest := float(np.abs(distances).max())) > _CRITICAL:
             off = f"one mode's own critical load is {farthest:.2g} of it off"
-            self.stopped = f"the modes are not critical at the load {load:.6g}: {off}"
+            self.stopped = f"the modes are not critical at e = {load:.6g}: {off}"
             return None
         self.splitting = float(np.ptp(distances))
         value = below.value + (load - below.load) * below.rate

@@ -278,7 +278,11 @@ def _declared(
         )
     found = given or next(iter(stated), None)
     if found is None:
-        raise InputError(f"{where}: expected {option} for {names}, got none; give {option}={both}")
+        like = "'u [px]' or 'u [mm]'" if option == "units" else "'y down' or 'y up'"
+        raise InputError(
+            f"{where}: expected {option} for {names}, got none; name columns like {like}, or give "
+            f"{option}={both}"
+        )
     return found
 
 

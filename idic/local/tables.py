@@ -45,10 +45,10 @@ def read_table(path: Path | str) -> Table:
     """
     path = Path(path)
     with reading(path, f"{_WHAT} ({path.suffix})", _REMEDY):
-        reader = _READERS.get(path.suffix.lower())
+        reader = READERS.get(path.suffix.lower())
         if reader is None:
             raise InputError(
-                f"{path}: expected one of {', '.join(sorted(_READERS))}, got {path.suffix!r}; "
+                f"{path}: expected one of {', '.join(sorted(READERS))}, got {path.suffix!r}; "
                 "save the field as CSV"
             )
         table = reader(path)
@@ -233,13 +233,14 @@ def _numeric(found: dict[str, Any]) -> Table:
     return table
 
 
-_READERS: dict[str, Callable[[Path], Table]] = {
+READERS: dict[str, Callable[[Path], Table]] = {
     **dict.fromkeys(TEXTS, _read_text),
     **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
     ".npz": _read_npz,
     ".mat": _read_mat,
     **dict.fromkeys((".vtk", ".vtu", ".vtp"), _read_vtk),
 }
+"""Readers by the ending of a file's name."""
 
 ROLES = ("x", "y", "u", "v")
 ALL_ROLES = (*ROLES, "sd_u", "sd_v", "sigma", "valid")

@@ -203,11 +203,11 @@ class HoleLattice:
             f"diameters {d.mean():.2f} ± {d.std():.2f} px."
         ]
         if len(self.missing):
-            text.append(f"Holes are missing at {len(self.missing)} lattice points amid them.")
+            text.append(f"Holes missing at lattice points amid them: {len(self.missing)}.")
         if len(self.extra):
-            text.append(f"{len(self.extra)} holes are not on the lattice and were left out.")
+            text.append(f"Holes off the lattice, left out: {len(self.extra)}.")
         if self.too_small:
-            text.append(f"{self.too_small} much smaller openings were left out.")
+            text.append(f"Much smaller openings, left out: {self.too_small}.")
         return tuple(text)
 
     def position(self, index: ArrayLike) -> FloatArray:

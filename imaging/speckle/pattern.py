@@ -235,7 +235,7 @@ class SpeckleSpec:
     """Parameters of the speckle pattern; InputError if a value is out of range."""
 
     standard_deviation: float = 1.0 / 20.0
-    """Standard deviation of the spectral density of the Gaussian field, in ``unit``."""
+    """Standard deviation of the spectral density of the Gaussian field [``unit``]."""
     unit: SpectralUnit = "cycles/px"
     """Either "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px" (2 pi
     times coarser); the paper doesn't specify it."""

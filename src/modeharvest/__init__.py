@@ -33,11 +33,13 @@ if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from modeharvest.imaging.spec import ImagingSpec
     from modeharvest.runs import run
     from modeharvest.runs.benchmark import score
+    from modeharvest.runs.case import shipped_solution
     from modeharvest.runs.photographs.pipeline import harvest
 
 __all__ = [
     "Ansatz", "Experiment", "ImagePair", "ImagingSpec", "Ogden", "Result", "Solution", "Specimen",
-    "__version__", "best_fit", "correlate", "harvest", "make_images", "run", "score", "simulate",
+    "__version__", "best_fit", "correlate", "harvest", "make_images", "run", "score",
+    "shipped_solution", "simulate",
 ]  # fmt: skip
 
 _HOMES = {
@@ -46,7 +48,7 @@ _HOMES = {
     "Solution": "fem.field", "Specimen": "fem.specimen", "best_fit": "idic.correlate",
     "correlate": "idic.correlate", "harvest": "runs.photographs.pipeline",
     "make_images": "imaging.imageset", "run": "runs", "score": "runs.benchmark",
-    "simulate": "fem.simulate",
+    "shipped_solution": "runs.case", "simulate": "fem.simulate",
 }  # fmt: skip
 
 

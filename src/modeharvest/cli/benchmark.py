@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from modeharvest.cli.messages import (
-    UNUSABLE,
-    CaseName,
-    OutFolder,
-    SolutionFile,
-    bars,
-    folder_option,
-    report_error,
-)
-from modeharvest.util.errors import InputError
+from modeharvest.cli.messages import CaseName, OutFolder, SolutionFile, bars, folder_option, refuse
 
 CodeNames = Annotated[
     list[str] | None, typer.Option("--name", help="Name of the code; once for each FIELD.")
@@ -70,7 +60,7 @@ def score(
     name: CodeNames = None,
     unit: Annotated[
         list[str] | None,
-        typer.Option("--unit", help="px or mm; 'file': as its columns' names say.", metavar="UNIT"),
+        typer.Option("--unit", help="px or mm; 'file': as the columns' names say.", metavar="UNIT"),
     ] = None,
     y_axis: YAxes = None,
     first_pixel: FirstPixels = None,
@@ -92,15 +82,7 @@ def score(
     with bars() as progress, exclusive(out):
         done = score_fields(declared, truth, strain, out, progress=progress)
     print_report(grading_report(done), out)
-    _refuse(done.refused)
-
-
-def _refuse(reasons: Mapping[str, str]) -> None:
-    """Print why fields were not graded, and exit with code 2 if there are any."""
-    for why in reasons.values():
-        report_error(InputError(why))
-    if reasons:
-        raise typer.Exit(UNUSABLE)
+    refuse(done.refused)
 
 
 def star(
@@ -161,4 +143,4 @@ def resolution(
     with bars() as progress, exclusive(out):
         done = grade_star(declared, quiet, folder, out, progress)
     print_report(star_report(done), out)
-    _refuse(done.refused)
+    refuse(done.refused)

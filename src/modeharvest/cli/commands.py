@@ -5,6 +5,7 @@ Commands import the modules they need when they are called, so that ``--help`` i
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 
 
 def cases(
-    name: Annotated[str | None, typer.Argument(help="Print this case's TOML file.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Print this case's TOML file.")
+    ] = None,
 ) -> None:
     """List the shipped cases and their commands, or print one to start your own from.
 
@@ -40,7 +43,7 @@ def cases(
 
 WholeField = Annotated[
     bool | None,
-    typer.Option(help="Measure the whole displacement on a mesh, up to every edge, or don't."),
+    typer.Option(help="Measure the whole displacement on a mesh, up to every edge (or not)."),
 ]
 
 
@@ -199,7 +202,7 @@ def harvest(
     whole_field: WholeField = None,
     contours: Annotated[
         bool | None,
-        typer.Option(help="Measure modes by the material's contours, too, not only by speckle."),
+        typer.Option(help="Measure modes also by the material's contours, not only by speckle."),
     ] = None,
     watch: Annotated[
         Path | None,
@@ -207,7 +210,7 @@ def harvest(
     ] = None,
     until_still: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="Stop watching when no photograph came for so long."),
+        typer.Option(metavar="SECONDS", help="Stop watching this long after the last photograph."),
     ] = None,
 ) -> None:
     """Measure modes in photographs of a test: v0, v1 and phi1 with error bars.
@@ -240,7 +243,8 @@ def _watch(experiment: Path, out: Path, folder: Path, until_still: float | None)
 
     print(watch_text(watch(experiment, out, folder, until_still=until_still,
                            show=lambda line: print(line, flush=True))))  # fmt: skip
-    print(f"measure them in full by: modeharvest harvest {experiment} --out {out}")
+    command = shlex.join(["modeharvest", "harvest", str(experiment), "--out", str(out)])
+    print(f"measure them in full by: {command}")
 
 
 def measure(
@@ -250,13 +254,13 @@ def measure(
     ],
     out: Annotated[Path, folder_option("--out", "Folder for all results.")],
     mask: Annotated[
-        Path | None, typer.Option(help="Image, black off the material; by default it is found.")
+        Path | None, typer.Option(help="Image, black outside the material; found by default.")
     ] = None,
     pixel_size: Annotated[
-        float | None, typer.Option(help="Edge of a pixel in mm; without, lengths are in px.")
+        float | None, typer.Option(help="Edge of a pixel in mm; without it, lengths are in px.")
     ] = None,
     mesh: Annotated[
-        Path | None, typer.Option(help="Mesh of triangles; origin: image's middle, x right, y up.")
+        Path | None, typer.Option(help="Mesh of triangles: origin in the image's middle, y up.")
     ] = None,
     brightness: Annotated[
         int, typer.Option(help="Degree of the polynomials of gain and offset over x, y: 0 to 6.")
@@ -272,9 +276,10 @@ def measure(
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
-    Images: TIFF, PNG, JPEG of one size, folders, videos. Specimens without speckle are measured by
-    contours if they are fully visible. Writes displacement, standard deviations, strains (HDF5,
-    VTU, CSV, TIFF), report.html, summary.json to DIR. If interrupted, run it again: it continues.
+    Images are TIFF, PNG or JPEG files of one size, folders, or videos. Specimens without speckle
+    are measured by their contours if they are fully visible. Writes displacement, standard
+    deviations and strains (HDF5, VTU, CSV, TIFF), report.html and summary.json to DIR. After an
+    interruption run the same command again: it continues.
 
     For example: modeharvest measure ref.tif def_*.tif --mask mask.png --out out/plate
     """

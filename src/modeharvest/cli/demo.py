@@ -19,7 +19,7 @@ ABOUT = (
     "metamaterials: buckle a cellular elastomer, make speckle images whose truth is known at "
     "every pixel, measure them, and see the errors of the measurement and their causes.\n\n"
     "Start with: [bold]modeharvest demo[/bold], then [bold]modeharvest run paper-virtual --out "
-    "out/demo[/bold], or [bold]modeharvest harvest --example[/bold] for your own photographs"
+    "out/demo[/bold], or [bold]modeharvest harvest --example[/bold] for your own photographs."
 )
 EXIT_CODES = (
     "Exit codes: 0 done, 2 the input can't be used (one line says why), 70 a fault in the "

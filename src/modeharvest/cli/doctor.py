@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from shlex import quote
 
 FEM = ("fenics-dolfinx", "petsc4py", "gmsh")
 OPTIONAL = {
@@ -103,16 +104,17 @@ def caches() -> Iterator[Row]:
         where = Path(os.environ["NUMBA_CACHE_DIR"]) if "NUMBA_CACHE_DIR" in os.environ else (
             package if folder.name == "__pycache__" else folder.parent
         )  # fmt: skip
-        yield "kernels", str(where), f"to remove: find -L {where} -name '*.nb[ic]' -delete"
+        found = f"find -L {quote(str(where))} -name '*.nb[ic]'"
+        yield "kernels", str(where), f"to remove: {found} -delete"
         for stage, seconds in stamps().items():
             took = f"took {seconds:.0f} s to compile ahead" if seconds else "compiled when needed"
             yield f"  of {stage}", took, ""
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     own = user / "modeharvest"
     if own.is_dir():
-        yield "scripts/env", str(own), f"environments; to remove: rm -r {own}"
+        yield "scripts/env", str(own), f"environments; to remove: rm -r {quote(str(own))}"
     if (fenics := user / "fenics").is_dir():
-        yield "dolfinx", str(fenics), f"compiled forms; to remove: rm -r {fenics}"
+        yield "dolfinx", str(fenics), f"compiled forms; to remove: rm -r {quote(str(fenics))}"
 
 
 def doctor() -> None:

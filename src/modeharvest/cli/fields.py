@@ -12,7 +12,7 @@ from modeharvest.cli.messages import bars, folder_option
 from modeharvest.util.errors import InputError
 
 Run = Annotated[Path, typer.Argument(metavar="DIR", help="A run's folder, or a file of it.")]
-_FORMATS = "ncorr, vic2d, davis, dice, matchid, gom, pyvale, csv, mat, npz; a run's hdf5, vtu, tiff"
+_FORMATS = "ncorr, vic2d, davis, dice, matchid, gom, pyvale, csv, mat, npz; runs: hdf5, vtu, tiff"
 
 
 def export(
@@ -84,7 +84,7 @@ def animate(
     ] = None,
     form: Annotated[str, typer.Option("--as", help="gif, mp4, or pdf of all fields.")] = "gif",
     photograph: Annotated[
-        list[Path] | None, typer.Option(help="Photograph of each image, in order, if moved.")
+        list[Path] | None, typer.Option(help="The photographs, in order, if they were moved.")
     ] = None,
 ) -> None:
     """Draw fields on the deformed photographs of a run: DIR/FIELD.gif, FIELD.mp4, fields.pdf."""

@@ -6,7 +6,7 @@ import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -146,6 +146,14 @@ def bars() -> Iterator[Progress]:
 def warn(message: str) -> None:
     """Print a warning to stderr."""
     console.print(f"[yellow]warning:[/yellow] {escape(message)}", highlight=False)
+
+
+def refuse(reasons: Mapping[str, str]) -> None:
+    """Print why files were not used, and exit with code 2 if there are any."""
+    for why in reasons.values():
+        report_error(InputError(why))
+    if reasons:
+        raise typer.Exit(UNUSABLE)
 
 
 def report_error(error: BaseException) -> int:

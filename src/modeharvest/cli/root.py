@@ -35,7 +35,7 @@ app = typer.Typer(
     add_completion=False,
 )
 benchmark_app = typer.Typer(
-    help="Make image sets for any DIC code, grade what it measures.", no_args_is_help=True
+    help="Make image sets for any DIC code, and grade what it measures.", no_args_is_help=True
 )
 
 _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {

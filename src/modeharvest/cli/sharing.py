@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from modeharvest.cli.messages import UNUSABLE, OutFolder, bars, folder_option
+from modeharvest.cli.messages import UNUSABLE, OutFolder, bars, folder_option, refuse
 
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of a finished run or set.")]
 
@@ -15,10 +15,10 @@ Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of a fini
 def share(
     folder: Folder,
     licence: Annotated[
-        str, typer.Option("--licence", help="CC-BY-4.0, CC0-1.0, or its https:// address.")
+        str, typer.Option("--licence", help="CC-BY-4.0, CC0-1.0, or another's https:// address.")
     ] = "CC-BY-4.0",
     author: Annotated[
-        str, typer.Option("--author", help="'Name <https://orcid.org/...>' of who made it.")
+        str, typer.Option("--author", help="Who made it: 'Name <https://orcid.org/...>'.")
     ] = "",
     title: Annotated[str, typer.Option("--title", help="Title; by default the run's.")] = "",
 ) -> None:
@@ -74,9 +74,8 @@ def leaderboard(
         board = ranked(codes, truth, out, progress)
     for n, row in enumerate(board["codes"], 1):
         print(f"{n}. {row['code']}: rms {row['rms_px']:.3g} px, mean of {row['counted']} cases")
-    for why in board["refused"].values():
-        print(f"not graded: {why}")
     print(f"report: {out / 'report.html'}")
+    refuse(board["refused"])
 
 
 COMMANDS = (verify, standard, leaderboard)

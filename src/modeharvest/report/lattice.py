@@ -143,7 +143,8 @@ def findings(summary: Summary) -> list[str]:
             text.append(text_of("lattice-error", load=load, error=error, order=point["order"],
                                 share=point["error"] / point["load"]))  # fmt: skip
     elif point is not None:
-        text.append(f"Under {_under(point['loading'])}: {summary['outcome']}; {proof(point)}.")
+        outcome = load.in_units(summary["outcome"])
+        text.append(f"Under {_under(point['loading'])}: {outcome}; {proof(point)}.")
     for part in summary["zone"]:
         at = load.text(part["load"])
         text.append(text_of("lattice-zone", name=wave_name(part["wave"]), at=at, **part))
@@ -212,8 +213,9 @@ def notes(summary: Summary) -> list[str]:
     """Notes on the conditions and limits of the numbers, made from the data."""
     text, point = [], summary["critical"]
     if point is not None and not point["found"]:
-        load = LoadQuantity(**summary["load"]).text(point["load"])
-        text.append(text_of("lattice-no-proof", outcome=summary["outcome"], point=point, load=load))
+        load = LoadQuantity(**summary["load"])
+        outcome, upto = load.in_units(summary["outcome"]), load.text(point["load"])
+        text.append(text_of("lattice-no-proof", outcome=outcome, point=point, load=upto))
     elif point is not None and point["long_wave_angle"] is not None:
         text.append(text_of("lattice-long-waves", loading=point["loading"]))
     if any(branch["states"] for branch in summary["branches"]):
@@ -346,7 +348,8 @@ def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
 
 def _last_state(branch: Mapping[str, Any], load: LoadQuantity) -> Mapping[str, Any]:
     """The table's row of a branch: its last state."""
-    named = {"name": combination_name(branch["combination"]), "outcome": branch["outcome"]}
+    outcome = load.in_units(branch["outcome"])
+    named = {"name": combination_name(branch["combination"]), "outcome": outcome}
     if not branch["states"]:
         return named | {"amplitudes": "–"}
     state = branch["states"][-1]

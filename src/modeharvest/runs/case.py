@@ -109,10 +109,17 @@ def case_text(name: str) -> str:
     return known[name].read_text("utf-8")
 
 
-def shipped_solution(name: str) -> Path | None:
-    """Path of the solution of a shipped case; None if the package contains none."""
-    path = Path(str(_SHIPPED / f"{name}.h5"))
-    return path if path.is_file() else None
+def shipped_solutions() -> dict[str, Path]:
+    """Paths of the solutions that are shipped with the package, by the names of their cases."""
+    return {path.stem: path for path in sorted(Path(str(_SHIPPED)).glob("*.h5"))}
+
+
+def shipped_solution(name: str) -> Path:
+    """Path of the solution of a shipped case; InputError if the package contains none."""
+    known = shipped_solutions()
+    if name not in known:
+        raise InputError(f"expected a case with a shipped solution among {list(known)}, got {name}")
+    return known[name]
 
 
 def _shipped() -> dict[str, Path]:

@@ -14,7 +14,7 @@ from modeharvest.runs.case import Case, checked, read_tables, table_of_kind
 from modeharvest.runs.experiment import Run
 from modeharvest.util.errors import requiring_dolfinx
 from modeharvest.util.files import require_writable, write_json
-from modeharvest.util.stages import StagedRun, exclusive, versions
+from modeharvest.util.stages import StagedRun, command_line, exclusive, versions
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.design import AXES, NEEDED, Design, DesignOptions
 from modeharvest.validation.design_parameters import ModelStates
@@ -87,7 +87,7 @@ class DesignRun(StagedRun[DesignCase]):
         shown = {"first": first, "second": second, "errors": errors}
         found = {
             "title": self.case.title or "Design of a test",
-            "command": f"modeharvest design {self.source} --out {self.folder}",
+            "command": command_line("design", self.source, "--out", self.folder),
             "critical_strain": design.critical,
             "setup": setup,
             "expected": expected,

@@ -33,7 +33,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
-from modeharvest.runs.case import Case, shipped_cases, shipped_solution
+from modeharvest.runs.case import Case, shipped_solutions
 from modeharvest.runs.precompile import precompiling
 from modeharvest.runs.whole_field import WholeFields, name_of
 from modeharvest.util.errors import InputError, MissingDependencyError, dolfinx_missing
@@ -277,9 +277,8 @@ class Run(StagedRun[Case]):
 
     def shipped(self) -> Solution | None:
         """The solution shipped with the package if it is of exactly this experiment, else None."""
-        for name in shipped_cases("experiment"):
-            path = shipped_solution(name)
-            if path is not None and Case.read(name).experiment == self.case.experiment:
+        for name, path in shipped_solutions().items():
+            if Case.read(name).experiment == self.case.experiment:
                 return Solution.read(path)
         return None
 

@@ -81,7 +81,7 @@ from modeharvest.util.files import (
 )
 from modeharvest.util.machine import require_memory
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
+from modeharvest.util.stages import StagedRun, command_line, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import picked
 
 _LEAST_PX = 1000
@@ -342,15 +342,12 @@ class MeasureRun(StagedRun[MeasureCase]):
         case = self.case
         return {
             "title": f"Displacement from {case.reference.name}",
-            "command": "modeharvest measure " + " ".join(
-                [str(case.reference), *case.deformed]
-                + [f"--mask {case.mask}"] * (case.mask is not None)
-                + [f"--pixel-size {case.pixel_size:g}" for _ in [0] if case.pixel_size]
-                + [f"--mesh {case.mesh}"] * (case.mesh is not None)
-                + [f"--brightness {case.brightness}"] * (case.brightness > 0)
-                + [f"--gauges {case.gauges}"] * (case.gauges is not None) + [*case.choice]
-                + [f"--out {self.folder}"]
-            ),
+            "command": command_line("measure", case.reference, *case.deformed, *(
+                word for option, value in (
+                    ("--mask", case.mask), ("--pixel-size", case.pixel_size), ("--mesh", case.mesh),
+                    ("--brightness", case.brightness or None), ("--gauges", case.gauges),
+                ) if value is not None for word in (option, value)
+            ), *case.choice, "--out", self.folder),
             "unit": case.unit,
             "pixel_size_mm": case.pixel_size,
             "shape_px": list(self.grid.shape),
@@ -438,8 +435,8 @@ def measure(
     sequence = chosen_frames(
         Path(), str(reference), names, choice, log, Path(folder), progress
     )  # fmt: skip
-    flags = [f"--every {choice.every}"] * (choice.every > 1)
-    flags += [f"--log {log.file}"] * bool(log.file)
+    flags = ["--every", str(choice.every)] * (choice.every > 1)
+    flags += ["--log", log.file] * bool(log.file)
     case = MeasureCase(
         sequence.reference, names, None if mask is None else Path(mask),
         pixel_size, None if mesh is None else Path(mesh), brightness, sequence,

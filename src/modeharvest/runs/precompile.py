@@ -41,7 +41,6 @@ _CASE = "paper-virtual"
 def _images() -> None:
     """Run a small example that compiles the kernels of the stage ``image``."""
     case, solution = Case.read(_CASE), shipped_solution(_CASE)
-    assert solution is not None
     spec = replace(case.imaging, pixel_size=0.1)
     with tempfile.TemporaryDirectory() as folder:
         make_images(Solution.read(solution), spec, folder, case.experiment.strains[-1:])

@@ -193,6 +193,11 @@ class Kept(Mapping[str, R]):
         return len(self._read)
 
 
+def command_line(*words: object) -> str:
+    """A command of the program, to be typed again: words with spaces are quoted."""
+    return shlex.join(["modeharvest", *map(str, words)])
+
+
 @dataclass(frozen=True)
 class StagedRun(Stages, Generic[C]):
     """Base of all kinds of runs: a case, a folder, and stages that are not repeated."""

@@ -32,6 +32,7 @@ LICENCES = {
 _TEMPORARY = (".*", "*.part", "*.log", "__pycache__")
 _KINDS = {".tif": "image/tiff", ".h5": "application/x-hdf5", ".vtu": "application/xml"}
 """Media types of files that Python's ``mimetypes`` doesn't know, by extension."""
+_RUN = "modeharvest run CASE.toml --out DIR, with the table 'case' of summary.json as CASE.toml"
 _UNITS = {"mm": "mm", "px": "px", "percent": "%", "N": "N", "MPa": "MPa", "deg": "degree"}
 
 
@@ -60,7 +61,7 @@ def write_crate(
     software = {"modeharvest": __version__, **info.get("versions", {})}
     made = [_software(library, version) for library, version in software.items()]
     title = name or str(info.get("title") or f"Benchmark {info.get('id', folder.name)}")
-    units = list(_quantities(info))
+    units = [*_quantities(info), *_columns(folder / "table.csv")]
     person, _, orcid = author.partition("<")
     at = orcid.strip(" >") or "#author"
     people = [_entity("Person", at, name=person.strip())] if person.strip() else []
@@ -75,7 +76,8 @@ def write_crate(
         "variableMeasured": [_to(unit) for unit in units],
         "mentions": {"@id": "#made"},
     }
-    command = str(info.get("command") or f"made with modeharvest {__version__}")
+    made_by = _RUN if "snapshots" in info else f"made with modeharvest {__version__}"
+    command = str(info.get("command") or made_by)
     action = _entity("CreateAction", "#made", name=command, description=command)
     action |= {"instrument": [_to(library) for library in made], "result": {"@id": "./"}}
     about = {"conformsTo": {"@id": PROFILE}, "about": {"@id": "./"}}
@@ -189,6 +191,14 @@ def _quantities(info: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         unit = _UNITS.get(key.rpartition("_")[2])
         if unit and isinstance(value, (int, float)) and not isinstance(value, bool):
             yield {**_entity("PropertyValue", f"#{key}", name=key, unitText=unit), "value": value}
+
+
+def _columns(table: Path) -> Iterator[dict[str, Any]]:
+    """Entries for columns of a study's table whose names end in their unit."""
+    head = table.read_text("utf-8").partition("\n")[0] if table.is_file() else ""
+    for name in head.split(","):
+        if unit := _UNITS.get(name.rpartition("_")[2]):
+            yield _entity("PropertyValue", f"{table.name}#{name}", name=name, unitText=unit)
 
 
 def _description(info: Mapping[str, Any]) -> str:

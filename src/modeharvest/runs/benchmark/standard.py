@@ -22,6 +22,7 @@ import numpy as np
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.idic.local.tables import READERS
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
 from modeharvest.runs.benchmark.crate import write_crate
 from modeharvest.runs.case import Case, shipped_solution
@@ -33,6 +34,8 @@ from modeharvest.validation.scoring.benchmark import SOLUTION, Declared
 from modeharvest.validation.scoring.score import ENOUGH_COVERED
 
 FORMAT, TRUTH = "modeharvest-standard-1", "standard.json"
+_REASONS = 3
+"""How many reasons are named if nothing could be graded."""
 
 
 def standard_cases(seed: int = 0) -> dict[str, Case]:
@@ -110,7 +113,11 @@ def leaderboard(
     known = read_record(truth / TRUTH, FORMAT, "the truth of a standard set", remedy)
     codes = sorted(p.name for p in handed_in.iterdir() if p.is_dir()) if handed_in.is_dir() else []
     found: dict[str, dict[str, Mapping[str, float]]] = {code: {} for code in codes}
-    refused: dict[str, str] = {}
+    refused = {
+        str(path): f"{path}: expected a file named as one of the cases {', '.join(known['cases'])}"
+        for code in codes for path in sorted((handed_in / code).iterdir())
+        if path.suffix.lower() in READERS and path.stem not in {*known["cases"], "README", "readme"}
+    }  # fmt: skip
     for name, case in known["cases"].items():
         files = {path: Declared(name=code) for code in codes
                  for path in sorted((handed_in / code).glob(f"{name}.*"))[:1]}  # fmt: skip
@@ -131,7 +138,8 @@ def leaderboard(
     if not rows:
         raise InputError(
             f"expected files CODE/CASE.csv in {handed_in}, got none to grade"
-            + "".join(f"; {why}" for why in refused.values())
+            + "".join(f"; {why}" for why in [*refused.values()][:_REASONS])
+            + f"; and {len(refused) - _REASONS} more" * (len(refused) > _REASONS)
         )
     board = {"set": known["id"], "title": known["title"], "codes": rows, "refused": refused}
     columns = ["code", "cases that count", "geometric mean of rms [px]", *known["cases"]]

@@ -57,7 +57,7 @@ from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, reading, sha256_of, write_json
 from modeharvest.util.machine import on_first
 from modeharvest.util.progress import named
-from modeharvest.util.stages import StagedRun, exclusive, stage_key
+from modeharvest.util.stages import StagedRun, command_line, exclusive, stage_key
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.homogenization import (
     LatticeMode,
@@ -505,7 +505,7 @@ class HomogenizationRun(StagedRun[HomogenizationCase]):
             warnings=(*warnings, *not_reached(found["response"], len(self.case.loads))),
             fields=fields, measured=self.result if is_compared else None,
             measured_strain=self._measured_strain,
-            command=f"modeharvest homogenize {self.source} --out {self.folder}",
+            command=command_line("homogenize", self.source, "--out", self.folder),
         )  # fmt: skip
 
 

@@ -177,6 +177,7 @@ def summary_of(title: str, case: Mapping[str, Any], data: HomogenizationData) ->
     source = "found" if case["homogenization"]["edge_shifts"] == "find" else "given"
     return {
         "title": title,
+        "command": data.command,
         "case": dict(case),
         "outcome": response["outcome"],
         "critical_strain": response["critical_strain"],

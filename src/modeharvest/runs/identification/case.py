@@ -127,6 +127,7 @@ class TwinTruth:
         require_within("twin: expected frame_strain", self.frame_strain, 0.0)
         require_within("twin: expected mesh_size [mm]", self.mesh_size, 0.0, above=True)
         require_within("twin: expected force_sd [N/mm]", self.force_sd, 0.0)
+        require_within("twin: expected a force_seed", self.force_seed, 0)
 
     def every(self, experiment: Experiment) -> dict[str, float]:
         """True values of the model's parameters by name, without those of the material."""

@@ -63,7 +63,7 @@ from modeharvest.runs.photographs.sequence import named_files
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, sha256_of, write_json
-from modeharvest.util.stages import StagedRun, exclusive, stage_key, versions
+from modeharvest.util.stages import StagedRun, command_line, exclusive, stage_key, versions
 from modeharvest.util.typed import to_plain
 
 _FRAME = {"centre": (0.005, "mm"), "orientation": (0.005, "rad"),
@@ -429,7 +429,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
         ]  # fmt: skip
         return dict[str, Any](to_plain({
             "title": case.title,
-            "command": f"modeharvest identify {self.source} --out {self.folder}",
+            "command": command_line("identify", self.source, "--out", self.folder),
             "parameters": parameters,
             "correlations": found.correlations,
             "model_error": found.model_error,

@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 from pydantic import model_validator
@@ -61,6 +61,14 @@ class LatticeSpec(Protocol):
         """The primitive cell, meshed; InputError if no such lattice exists."""
 
 
+def _require_holes(lattice: SquareLattice | HexagonalLattice) -> None:
+    """Raise InputError unless lengths are positive and holes don't touch."""
+    require_within("expected mesh_size [mm]", lattice.mesh_size, 0.0, above=True)
+    if not 0 < lattice.diameter < lattice.pitch < math.inf:
+        got = f"{lattice.diameter} and {lattice.pitch}"
+        raise InputError(f"expected 0 < diameter < pitch [mm], got {got}; holes must not touch")
+
+
 @dataclass(frozen=True)
 class SquareLattice:
     """Holes in square stacking: pitch l, diameter d, edge length of the elements [mm]."""
@@ -69,6 +77,9 @@ class SquareLattice:
     diameter: float = 1.5
     mesh_size: float = 0.15
     symmetry = "square"
+
+    def __post_init__(self) -> None:
+        _require_holes(self)
 
     def cell(self) -> UnitCell:
         """The primitive cell, with one hole."""
@@ -85,6 +96,9 @@ class HexagonalLattice:
     diameter: float = 1.28
     mesh_size: float = 0.1
     symmetry = "hexagonal"
+
+    def __post_init__(self) -> None:
+        _require_holes(self)
 
     def cell(self) -> UnitCell:
         """The primitive cell, with one hole."""
@@ -104,11 +118,16 @@ class ChiralLattice:
     ring_radius: float | None = None
     ring_thickness: float | None = None
     ligament_thickness: float | None = None
-    """Dimensions divided by ``pitch`` [-]; by default those of ``chiral``."""
-    handedness: str = "clockwise"
+    """Dimensions [mm]; by default those of ``fem.lattice.cells.chiral``."""
+    handedness: Literal["clockwise", "counterclockwise"] = "clockwise"
     """Either "clockwise" or "counterclockwise"."""
     ligaments = 4
     symmetry = "square"
+
+    def __post_init__(self) -> None:
+        for name in ("pitch", "mesh_size", "ring_radius", "ring_thickness", "ligament_thickness"):
+            if (value := getattr(self, name)) is not None:
+                require_within(f"expected {name} [mm]", value, 0.0, above=True)
 
     def cell(self) -> UnitCell:
         """The primitive cell: one ring."""
@@ -148,6 +167,11 @@ class FileLattice:
     primitive: bool = True
     """Whether a supercell is reduced to its primitive cell, to which waves and modes refer."""
     symmetry = "oblique"
+
+    def __post_init__(self) -> None:
+        require_within("expected pitch [mm]", self.pitch, 0.0, above=True)
+        if self.mesh_size is not None:
+            require_within("expected mesh_size [mm]", self.mesh_size, 0.0, above=True)
 
     def cell(self) -> UnitCell:
         """The cell in the file, or its primitive cell."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -39,6 +40,10 @@ class LoadQuantity:
         """A load with its unit, such as "8.805 %", "0.0121 MPa" or "e = 0.3"."""
         value = f"{self.per_load * load:.{digits}g}".replace("-", "−")
         return f"{value} {self.unit}" if self.unit else f"e = {value}"
+
+    def in_units(self, outcome: str) -> str:
+        """The text of an analysis with its loads, such as "e = 0.2", as this quantity's values."""
+        return re.sub(r"e = (\d[\d.e-]*\d|\d)", lambda e: self.text(float(e[1]), 6), outcome)
 
     @property
     def axis(self) -> str:

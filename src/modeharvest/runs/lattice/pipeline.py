@@ -23,7 +23,7 @@ from modeharvest.util import __version__
 from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, reading, sha256_of, write_json
 from modeharvest.util.progress import counted, named
-from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key
+from modeharvest.util.stages import StagedRun, command_line, digest, exclusive, stage_key
 from modeharvest.util.typed import made, to_plain
 
 if TYPE_CHECKING:
@@ -313,7 +313,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return LatticeRun(
             title=self.case.title or "An infinite lattice",
             case=self.case.plain(),
-            command=f"modeharvest {command} {self.source} --out {self.folder}",
+            command=command_line(command, self.source, "--out", self.folder),
             mesh=unit.mesh,
             lattice=unit.lattice,
             pitch=self.case.lattice.pitch,

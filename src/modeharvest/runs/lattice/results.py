@@ -273,6 +273,7 @@ def summary_of(run: LatticeRun, families: Sequence[FoundPattern]) -> dict[str, A
     critical, modes, study = run.critical, run.modes, run.study
     return {
         "title": run.title,
+        "command": run.command,
         "case": dict(run.case),
         "outcome": critical.outcome if critical else "",
         "load": to_plain(run.load),

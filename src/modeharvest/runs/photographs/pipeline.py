@@ -88,7 +88,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, counted, silent
-from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
+from modeharvest.util.stages import StagedRun, command_line, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import find_buckling, load_axis, mean_strain
 
@@ -189,7 +189,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             full_scale=prepared.full_scale, text=(*prepared.notes, *region.text),
             warnings=(*prepared.warnings, *self.geometry.few_cells(case.specimen.cell_size)),
             truth=truth,
-            command=f"modeharvest harvest {self.source} --out {self.folder}",
+            command=command_line("harvest", self.source, "--out", self.folder),
             toml=source.read_text("utf-8") if source.is_file() else "",
             versions=versions(*prepare.LIBRARIES),
         )  # fmt: skip

@@ -315,6 +315,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
     """The content of ``summary.json``, plain JSON values."""
     summary = {
         "title": harvest.case.title or "Photographs of a test",
+        "command": harvest.command,
         "experiment": harvest.case.plain(),
         "pixel_size_mm": harvest.grid.pixel_size,
         "cell_size_mm": harvest.pitch,
