@@ -360,7 +360,7 @@ class _Measurement:
                 self.through(stage)
             if self.unlike().sum() >= unlike.sum():
                 (self.u, self.prior), self.kept = last, None
-                self._hide(~known[body.mesh.cells].any(axis=1), *stages)
+                self._hide(np.asarray(~known[body.mesh.cells].any(axis=1)), *stages)
                 break
             self.start = start
 
@@ -370,7 +370,7 @@ class _Measurement:
         around, before = on.pixels.only(np.repeat(cells, np.diff(on.pixels.start))), self.hidden
         if around.row.size > _MOST_HIDDEN * on.pixels.row.size:
             return
-        differ = np.ones(around.row.size, np.bool_)
+        differ: BoolArray = np.ones(around.row.size, np.bool_)
         limit = _DIFFERS * float(on.pixels.grey.std()) + _BY_CHANCE * np.sqrt(sum(self.noise))
         for then in (stages, full, full):  # blurred images mix them with what is around
             hidden = np.zeros_like(before)
