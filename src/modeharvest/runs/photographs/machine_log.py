@@ -16,7 +16,7 @@ import numpy as np
 
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within
-from modeharvest.util.files import reading
+from modeharvest.util.files import encoding_of, reading
 
 _NAMES = {
     "time": r"^(test|total|elapsed|laufende?|pr[uü]f)?[ _-]*(time|zeit|temps|tiempo|tempo|t"
@@ -173,13 +173,10 @@ def offset_between(
 
 
 def _text(path: Path) -> str:
-    raw = path.read_bytes()
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return raw.decode("utf-16")
     try:
-        return raw.decode("utf-8-sig")
+        return path.read_text(encoding_of(path))
     except UnicodeDecodeError:
-        return raw.decode("latin-1")
+        return path.read_text("latin-1")
 
 
 def _rows(text: str) -> tuple[list[list[str]], list[list[str]], str]:
