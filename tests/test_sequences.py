@@ -260,6 +260,21 @@ def test_columns_are_named_where_they_are_not_known(tmp_path: Path) -> None:
         read_log(path, LogTable("log.csv"))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Zeit [s];Kraft [N]\n0,5;1.000\n1,5;2.000\n",
+        "Time [s];Force [N]\n0.5;1,000\n1.5;2,000\n",
+        '"Time","Force"\n"(s)","(N)"\n"0.5","1,000"\n"1.5","2,000"\n',
+        '"Zeit","Kraft"\n"(s)","(N)"\n"0,5","1.000,0"\n"1,5","2.000,0"\n',
+    ],
+)
+def test_thousands_are_no_fractions(tmp_path: Path, text: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    log = read_log(tmp_path / "log.csv", LogTable("log.csv"))
+    assert (list(log.time), list(log.force)) == ([0.5, 1.5], [1000.0, 2000.0])
+
+
 def stamped(base: Path, hour: int = 10) -> Path:
     return folder_of(base / "shots", [f"c_20260301_{hour}000{s}" for s in range(4)])
 
@@ -283,6 +298,30 @@ def test_another_time_zone_is_found_and_reported(tmp_path: Path) -> None:
     forces = [known["force_N"] for known in found.recorded.values()]
     assert forces == pytest.approx([0, 2.5, 5, 1007.5])
     assert any("-2 h ahead" in note and "time zone" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [("Time", "2026-03-01T10:{:02}:00"), ("Uhrzeit", "10:{:02}:00"),
+     ("Time", "03/01/2026 10:{:02}:00 AM"), ("Time", "10:{:02}:00 AM")],
+)  # fmt: skip
+def test_photographs_from_before_the_log_are_in_its_time_zone(
+    tmp_path: Path, head: str, row: str
+) -> None:
+    """A quarter of an hour later all of them would be within the log."""
+    rows = [f"{row.format(minute)};{minute}" for minute in range(60)]
+    (tmp_path / "log.csv").write_text("\n".join([f"{head};Force [N]", *rows]))
+    folder_of(tmp_path / "shots", [f"c_20260301_{t}00" for t in ("0955", "1005", "1010", "1030")])
+    found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
+    assert [known["force_N"] for known in found.recorded.values()] == [None, 5.0, 10.0, 30.0]
+    assert not any("time zone" in note for note in found.notes)
+
+
+def test_a_log_without_dates_goes_on_after_midnight(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("Time;Force [N]\n23:59:50;1\n00:00:00;2\n00:00:10;3\n")
+    folder_of(tmp_path / "shots", ["c_20260301_235950", "c_20260302_000005"])
+    found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
+    assert [known["force_N"] for known in found.recorded.values()] == [1.0, 2.5]
 
 
 def test_an_offset_may_be_given_and_what_was_not_logged_has_no_force(tmp_path: Path) -> None:

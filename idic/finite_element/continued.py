@@ -8,6 +8,7 @@ pixels of the material have when they are continued from the others.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,12 +35,14 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     """Make one level of an image pair; on the finest, g is continued by quadratic polynomials.
 
     pair, level : as for :func:`modeharvest.idic.solver.pyramid.level_pair`.
-    edge_px : pixels closer than this to the mask's edge are left out on the finest level [px].
+    edge_px : pixels closer than this to the mask's edge are left out [px].
     order : of the spline that samples g.
     """
-    if level != FULL:
-        return level_pair(pair, level, edge_px, order)
     inside, mask = pair.masks
+    if level != FULL:
+        # Background at the reference's edges, which g's mask leaves out, would move its corners.
+        sharp = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, edge_px))
+        return level_pair(sharp, level, edge_px, order)
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
     g, inside = continued_spline(pair.deformed, mask, order), eroded(inside, edge_px)
     return LevelPair(pair.grid, pair.reference, g, inside, None if valid.all() else valid)
