@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -179,6 +180,24 @@ def test_frames_of_a_video(tmp_path: Path, kind: str) -> None:
     chosen_frames(tmp_path, f"test.{kind}", [f"test.{kind}"], FrameChoice(every=5), LogTable(),
                   tmp_path / "out")  # fmt: skip
     assert [path.stat().st_mtime_ns for path in found.deformed] == stamps  # finished before
+
+
+@pytest.mark.parametrize("kind", ["mp4", "mkv"])
+def test_a_video_at_unequal_times_has_every_frame_once(tmp_path: Path, kind: str) -> None:
+    """As telephones film: to keep a rate, frames were repeated, and as many at the end left out."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    late = "setpts=(N+4*gte(N\\,2))/(4*TB)"  # a second passes after the second frame
+    subprocess.run(
+        [ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", film(tmp_path / "even.mp4", 6), "-vf", late,
+         "-crf", "1", tmp_path / f"test.{kind}"], check=True,
+    )  # fmt: skip
+    path = f"test.{kind}"
+    found = chosen_frames(tmp_path, path, [path], FrameChoice(), LogTable(), tmp_path / "out")
+    levels = [np.asarray(Image.open(path)).mean() for path in (found.reference, *found.deformed)]
+    assert levels == pytest.approx([20, 30, 40, 50, 60, 70], abs=2.0)
+    times = [known["time_s"] for known in found.recorded.values()]
+    assert times == pytest.approx([0.25, 1.5, 1.75, 2.0, 2.25], abs=0.01)
+    assert any("at unequal times" in note for note in found.notes)
 
 
 def test_a_reference_inside_a_video(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ from modeharvest.util.files import encoding_of, reading
 
 _NAMES = {
     "time": r"^(test|total|elapsed|laufende?|pr[uü]f)?[ _-]*(time|zeit|temps|tiempo|tempo|t"
-    r"|datetime|timestamp|time ?stamp|zeitpunkt|zeitstempel|date[ _/&-]*time|datum[ _/&-]*zeit|clock|uhrzeit)$",
+    r"|datetime|timestamp|time ?stamp|zeitpunkt|zeitstempel|date[ _/&-]*time|datum[ _/&-]*zeit"
+    r"|clock|uhrzeit)$",
     "force": r"^(axial|standard|pr[uü]f|max\.?)?[ _-]*(force|load|kraft|last|fuerza|carga|forza"
     r"|f|fz|load ?cell|kraftmessdose)([ _-]*\d)?$",
     "crosshead": r"(crosshead|traverse|position|displacement|extension|stroke|standardweg|^weg$|"
