@@ -21,7 +21,7 @@ from modeharvest.util.errors import InputError, MissingDependencyError
 from modeharvest.util.files import require_file
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".webm", ".wmv")
-PICTURES = (".tif", ".tiff", ".png", ".jpg", ".jpeg")
+PICTURES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp")
 HOW_TO_GET = "videos are read by imageio-ffmpeg: install it with 'pip install imageio-ffmpeg'"
 _DATE = re.compile(
     r"(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_.T ]*([0-2]\d)[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)"
