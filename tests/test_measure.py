@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import tifffile
 from explored import content_of, quantity, samples
 from manufactured import inverted, speckle
 from plate_with_hole import GRID, plate_pair, quadratic_field
+from scipy.ndimage import gaussian_filter
 from summary_schemas import faults
 from test_cli import called, error_line
 
@@ -224,7 +226,7 @@ def no_numbers(
     plate: Plate, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[dict[str, Any], Path]:
     """Of a folder with an empty file, without a mask and a pixel size: summary and output."""
-    shots, out = tmp_path_factory.mktemp("shots"), tmp_path_factory.mktemp("no_numbers")
+    shots, out = tmp_path_factory.mktemp("Prüfung (3)"), tmp_path_factory.mktemp("no numbers")
     (shots / "a.tif").write_bytes((plate.folder / "a.tif").read_bytes())
     (shots / "b.tif").touch()
     return measure(plate.folder / "ref.tif", [shots], out), out
@@ -233,9 +235,11 @@ def no_numbers(
 def test_an_empty_file_in_a_folder_is_skipped_and_the_rest_goes_on(
     no_numbers: tuple[dict[str, Any], Path],
 ) -> None:
-    summary, _ = no_numbers
+    summary, out = no_numbers
     (image,), (skipped,) = summary["images"], summary["skipped"]
     assert (image["name"], skipped["name"]) == ("a", "b")
+    command = shlex.split(summary["command"])
+    assert command[-3:] == [str(Path(image["file"]).parent), "--out", str(out)]
     assert "an empty file, cut short at 0 bytes" in skipped["reason"]
 
 
@@ -249,8 +253,21 @@ def test_material_is_found_and_lengths_are_pixels(
     both = plate.mask & np.isfinite(error).all(axis=-1)
     assert both.sum() > 0.9 * plate.mask.sum()
     assert np.sqrt(np.mean(error[both] ** 2)) < 0.1
-    assert summary["unit"] == "px"
+    assert (summary["unit"], summary["mask"]) == ("px", "found by its speckle")
     assert image["coverage"] > 0.99
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_a_photograph_without_background_says_so(plate: Plate, tmp_path: Path) -> None:
+    """One with a background as rough as speckle does, too, and is measured as a whole."""
+    field = gaussian_filter(np.random.default_rng(0).standard_normal((150, 160)), 2.5)
+    image = (128 + 60 * np.tanh(field / field.std())).astype(np.uint8)
+    for name in ("ref", "a"):
+        write_image(tmp_path / f"{name}.tif", image)
+    summary = measure(tmp_path / "ref.tif", [tmp_path / "a.tif"], tmp_path / "out")
+    assert summary["mask"] == "the whole image, as no background was found"
+    assert summary["material_px"] == image.size
+    assert summary["images"][0]["max_px"] < 0.01
 
 
 @pytest.mark.usefixtures("undrawn_pictures")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 from synthetic_photographs import Photographed, lattice_points, of
 
 from modeharvest.idic.ansatz import Ansatz
@@ -198,6 +200,24 @@ def test_a_video_at_unequal_times_has_every_frame_once(tmp_path: Path, kind: str
     times = [known["time_s"] for known in found.recorded.values()]
     assert times == pytest.approx([0.25, 1.5, 1.75, 2.0, 2.25], abs=0.01)
     assert any("at unequal times" in note for note in found.notes)
+
+
+def test_a_video_compressed_to_mush_is_one_line(tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    noise = np.random.default_rng(0).normal(128.0, 20.0, (8, 64, 96))
+    for quality in (1, 28):
+        stream = ffmpeg.write_frames(
+            str(tmp_path / f"crf{quality}.mp4"), (96, 64), pix_fmt_in="gray", codec="libx264",
+            output_params=["-crf", f"{quality}"], macro_block_size=1, ffmpeg_log_level="error",
+        )  # fmt: skip
+        stream.send(None)
+        for image in gaussian_filter(noise, (0, 2, 2)):  # speckle of 7 px
+            stream.send(np.clip(128 + 10 * (image - 128), 0, 255).astype(np.uint8))
+        stream.close()
+    assert len(Video.of(tmp_path / "crf1.mp4").about()) == 1
+    assert re.match(
+        r"crf28\.mp4 is compressed to 0\.\d", Video.of(tmp_path / "crf28.mp4").about()[1]
+    )
 
 
 def test_a_reference_inside_a_video(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.idic.solver.pyramid import FELT, FULL, Level, LevelPair, eroded, level_pair
+from modeharvest.idic.solver.pyramid import FELT, FULL, Level, LevelPair, binned, eroded, level_pair
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage, border_reach
 from modeharvest.util.arrays import BoolArray, FloatImage
@@ -35,14 +35,16 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     """Make one level of an image pair; on the finest, g is continued by quadratic polynomials.
 
     pair, level : as for :func:`modeharvest.idic.solver.pyramid.level_pair`.
-    edge_px : pixels closer than this to the mask's edge are left out [px].
+    edge_px : grey levels closer than this to the mask's edge are left out [px]; on coarser levels
+        those farther inside are continued in their place.
     order : of the spline that samples g.
     """
     inside, mask = pair.masks
     if level != FULL:
         # Background at the reference's edges, which g's mask leaves out, would move its corners.
-        sharp = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, edge_px))
-        return level_pair(sharp, level, edge_px, order)
+        pure = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, edge_px))
+        covered = binned(pair.reference, inside, level.factor)[1] >= 0.5
+        return replace(level_pair(pure, level, edge_px, order), mask=covered)
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
     g, inside = continued_spline(pair.deformed, mask, order), eroded(inside, edge_px)
     return LevelPair(pair.grid, pair.reference, g, inside, None if valid.all() else valid)

@@ -161,6 +161,8 @@ class Video:
     path: Path
     times: tuple[float, ...]
     """Times of the frames since the first [s], of the file's packets, without decoding them."""
+    bits_per_pixel: float
+    """Size of the packets over the number of pixels of all frames [bit]."""
 
     @property
     def count(self) -> int:
@@ -191,14 +193,29 @@ class Video:
         rate = re.search(r"([\d.]+) fps", copied.stderr) or re.search(
             r"([\d.]+) tbr", copied.stderr
         )
-        if not packets or not base or not rate:
+        size = re.search(r"Video: .*?, (\d+)x(\d+)", copied.stderr)
+        if not packets or not base or not rate or not size:
             last = (copied.stderr.strip().splitlines() or ["no word"])[-1].strip()
             raise InputError(f"expected a video at {path}, ffmpeg says: {last:.100}; {_REMEDY}")
         stamps = np.sort([int(packet[2]) for packet in packets])
         times = (stamps - stamps[0]) * int(base[1]) / int(base[2])
         if stamps[0] == _UNKNOWN or not np.all(np.diff(stamps)):
             times = np.arange(len(packets)) / float(rate[1])
-        return cls(path, tuple(times.tolist()))
+        bits = 8 * sum(int(packet[4]) for packet in packets)
+        pixels = len(packets) * int(size[1]) * int(size[2])
+        return cls(path, tuple(times.tolist()), bits / pixels)
+
+    def about(self) -> tuple[str, ...]:
+        """Texts about its frames, and on what increases errors."""
+        steady = "" if self.is_steady else ", at unequal times, which are read from it"
+        text = f"{self.path.name}: {self.count} frames, {self.rate:.4g} a second{steady}."
+        if self.bits_per_pixel >= _FEW_BITS:
+            return (text,)
+        return text, (
+            f"{self.path.name} is compressed to {self.bits_per_pixel:.2g} bits a pixel, less than "
+            "a camera's noise has: errors are larger than error bars say; film with less "
+            "compression, best with none."
+        )
 
     def frame(self, number: int) -> SequenceFrame:
         """The frame with a given number, from 0."""
@@ -230,6 +247,8 @@ class Video:
                 decoder.kill()
 
 
+_FEW_BITS = 1.0
+"""Bits a pixel below which a video is reported: as many as noise of a quarter of a level has."""
 _UNKNOWN = -(2**63)
 """ffmpeg's time stamp of a packet without one."""
 _REMEDY = "convert it, best to single TIFF images, or export it again"

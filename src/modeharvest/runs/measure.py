@@ -17,6 +17,7 @@ the middle of the image, x points right, y up.
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -338,24 +339,29 @@ class MeasureRun(StagedRun[MeasureCase]):
             write_json(self.folder / "summary.json", summary)
         return summary
 
+    @property
+    def _command(self) -> str:
+        """The command, for a shell."""
+        case = self.case
+        files = {"mask": case.mask, "mesh": case.mesh, "gauges": case.gauges, "out": self.folder}
+        values = {"pixel-size": case.pixel_size and f"{case.pixel_size:g}",
+                  "brightness": case.brightness} | files  # fmt: skip
+        options = [part for name, value in values.items() if value
+                   for part in (f"--{name}", str(value))]  # fmt: skip
+        names = [str(case.reference), *case.deformed]
+        return shlex.join(["modeharvest", "measure", *names, *case.choice, *options])
+
     def _summary(self, results: Mapping[str, NodalResult]) -> dict[str, Any]:
         case = self.case
         return {
             "title": f"Displacement from {case.reference.name}",
-            "command": "modeharvest measure " + " ".join(
-                [str(case.reference), *case.deformed]
-                + [f"--mask {case.mask}"] * (case.mask is not None)
-                + [f"--pixel-size {case.pixel_size:g}" for _ in [0] if case.pixel_size]
-                + [f"--mesh {case.mesh}"] * (case.mesh is not None)
-                + [f"--brightness {case.brightness}"] * (case.brightness > 0)
-                + [f"--gauges {case.gauges}"] * (case.gauges is not None) + [*case.choice]
-                + [f"--out {self.folder}"]
-            ),
+            "command": self._command,
             "unit": case.unit,
             "pixel_size_mm": case.pixel_size,
             "shape_px": list(self.grid.shape),
             "material_px": int(self.material.mask.sum()),
             "mask": "given" if not case.mask is case.mesh is None
+            else "the whole image, as no background was found" if self.material.mask.all()
             else "found by its speckle" if self.plain is None
             else "found by its grey level",
             "notes": [*self.reference.notes, *(case.sequence.notes if case.sequence else ())],
@@ -438,8 +444,8 @@ def measure(
     sequence = chosen_frames(
         Path(), str(reference), names, choice, log, Path(folder), progress
     )  # fmt: skip
-    flags = [f"--every {choice.every}"] * (choice.every > 1)
-    flags += [f"--log {log.file}"] * bool(log.file)
+    flags = ["--every", str(choice.every)] if choice.every > 1 else []
+    flags += ["--log", log.file] if log.file else []
     case = MeasureCase(
         sequence.reference, names, None if mask is None else Path(mask),
         pixel_size, None if mesh is None else Path(mesh), brightness, sequence,

@@ -174,10 +174,7 @@ def _all_frames(
     for name in names:
         if is_video(name):
             video = Video.of(base / name)
-            steady = "" if video.is_steady else ", at unequal times, which are read from it"
-            notes.append(
-                f"{video.path.name}: {video.count} frames, {video.rate:.4g} a second{steady}."
-            )
+            notes += video.about()
             frames += map(video.frame, range(video.count))
             continue
         taken = {frame.name for frame in frames}
