@@ -243,6 +243,19 @@ def test_an_empty_file_in_a_folder_is_skipped_and_the_rest_goes_on(
     assert "an empty file, cut short at 0 bytes" in skipped["reason"]
 
 
+def test_light_may_slope_by_default(plate: Plate, tmp_path: Path, undrawn_pictures: None) -> None:
+    """A lamp that has moved made errors of 0.1 px, a change of 2 % some without a warning."""
+    slope = 1.0 + 0.05 * np.linspace(-1.0, 1.0, GRID.cols)
+    image = np.clip(tifffile.imread(plate.files[0]) * slope, 0, 255).astype(np.uint8)
+    write_image(tmp_path / "a.tif", image)
+    summary = measure(plate.folder / "ref.tif", [tmp_path / "a.tif"], tmp_path / "out",
+                      mask=plate.folder / "mask.tif")  # fmt: skip
+    assert summary["images"][0]["warnings"] == []
+    u = read_result(tmp_path / "out/results/a.h5").displacement_on()
+    error = (u - plate.truth["a"] / GRID.pixel_size)[plate.mask]
+    assert np.sqrt(np.nanmean(error**2)) < 0.03
+
+
 def test_material_is_found_and_lengths_are_pixels(
     plate: Plate, no_numbers: tuple[dict[str, Any], Path]
 ) -> None:
@@ -319,13 +332,22 @@ def test_what_does_not_match_is_reported(plate: Plate, tmp_path: Path) -> None:
     assert "the images don't match" in summary["images"][0]["warnings"][-1]
 
 
+@pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize(("share", "count"), [(0.01, 0), (0.03, 1)])
-def test_light_that_changes_along_the_material_is_reported(share: float, count: int) -> None:
+def test_light_that_changes_along_the_material_is_reported(
+    share: float, count: int, degree: int
+) -> None:
+    """A slope where gain and offset are constants, a spot where they are linear."""
     pair, _ = plate_and_body()
-    light = np.linspace(1.0 - share, 1.0 + share, GRID.cols)  # beside the material, too
+    across = np.linspace(-1.0, 1.0, GRID.cols)  # beside the material, too
+    light = 1.0 + share * (across if degree == 0 else 3.0 * across**2)
     assert pair.truth is not None
     lit = pair.with_images(pair.reference, light * pair.deformed)
-    assert len(uneven_light(lit, pair.truth.displacement)) == count
+    found = uneven_light(lit, pair.truth.displacement, degree)
+    assert len(found) == count
+    assert all(f"--brightness {degree + 1} or" in text for text in found)
+    slope = pair.with_images(pair.reference, (1.0 + 0.05 * across) * pair.deformed)
+    assert not uneven_light(slope, pair.truth.displacement, 1)
 
 
 @pytest.mark.usefixtures("undrawn_pictures")

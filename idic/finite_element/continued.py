@@ -24,6 +24,8 @@ from modeharvest.util.masks import grown
 
 _REACH_PX = 4
 """Distance beyond the material up to which pixels are continued by polynomials [px]."""
+_RIM_PX = 2
+"""Pixels along edges that may show some background, on masks found in photographs."""
 _SIGMA_PX = 1.5
 """Standard deviation of the Gaussian weights of the material's pixels for that."""
 _WINDOW_PX = 6
@@ -35,14 +37,15 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     """Make one level of an image pair; on the finest, g is continued by quadratic polynomials.
 
     pair, level : as for :func:`modeharvest.idic.solver.pyramid.level_pair`.
-    edge_px : grey levels closer than this to the mask's edge are left out [px]; on coarser levels
-        those farther inside are continued in their place.
+    edge_px : pixels closer than this to the mask's edge are left out on the finest level [px]; on
+        others, up to 2 px from the edge, those farther inside are continued in their place.
     order : of the spline that samples g.
     """
     inside, mask = pair.masks
     if level != FULL:
         # Background at the reference's edges, which g's mask leaves out, would move its corners.
-        pure = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, edge_px))
+        rim = min(edge_px, _RIM_PX)
+        pure = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, rim))
         covered = binned(pair.reference, inside, level.factor)[1] >= 0.5
         return replace(level_pair(pure, level, edge_px, order), mask=covered)
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))

@@ -263,15 +263,19 @@ def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
     return found
 
 
-def uneven_light(pair: ImagePair, u: FloatArray) -> tuple[str, ...]:
-    """Warn if the light changed differently over the material; ``u`` (rows, cols, 2) [mm]."""
-    mask, maps = pair.masks[0], brightness(pair, u, 1)
-    gain, offset = (part[mask] for part in maps)
-    level = (float(pair.reference[mask].mean()) - offset) / gain
-    change = float(np.ptp(level) / abs(level.mean()))
+def uneven_light(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[str, ...]:
+    """Warn if the light changed over the material otherwise than by polynomials of a degree.
+
+    ``u`` (rows, cols, 2) [mm].
+    """
+    mask, typical = pair.masks[0], float(pair.reference[pair.masks[0]].mean())
+    maps = (brightness(pair, u, of) for of in (degree, degree + 1))
+    level, finer = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
+    change = float(np.ptp(finer - level) / abs(finer.mean()))
     text = (
         f"The light changed along the material, by {100 * change:.0f} %, which is taken for "
-        "displacement: measure with --brightness 1 or 2, harvest with gain_degree 1 or 2."
+        f"displacement: measure with --brightness {degree + 1} or {degree + 2}, harvest with "
+        f"gain_degree {degree + 1} or {degree + 2}."
     )
     return (text,) * (change > _UNEVEN)
 

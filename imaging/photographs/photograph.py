@@ -32,8 +32,8 @@ _BLOCK_PX, _BLOCKY = 8, 1.5
 """Edge of the compression blocks [px]; ratio of steps between blocks to those within, above which
 blocks are reported: at most 1.2 without compression, 1.5 to 2.8 for JPEG of quality 50."""
 _MUSH = (
-    "Compression shows, as blocks of 8 x 8 px: errors are larger than error bars, which don't know "
-    "of it; save photographs as TIFF or PNG, or as JPEG of quality 95."
+    "Compression shows, as blocks of 8 x 8 px: it makes errors larger, of which error bars of "
+    "modes don't know; save photographs as TIFF or PNG, or as JPEG of quality 95."
 )
 _MOSAIC, _SURE = 0.3, 6.0
 """Mean alternation of grey levels in blocks of 2 x 2 px, over its standard deviation, above which

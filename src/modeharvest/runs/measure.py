@@ -110,7 +110,7 @@ class MeasureCase:
     mask: Path | None = None
     pixel_size: float | None = None
     mesh: Path | None = None
-    brightness: int = 0
+    brightness: int = 1
     sequence: ChosenFrames | None = None
     choice: tuple[str, ...] = ()
     gauges: Path | None = None
@@ -344,8 +344,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         """The command, for a shell."""
         case = self.case
         files = {"mask": case.mask, "mesh": case.mesh, "gauges": case.gauges, "out": self.folder}
+        brightness = str(case.brightness) if case.brightness != 1 else ""
         values = {"pixel-size": case.pixel_size and f"{case.pixel_size:g}",
-                  "brightness": case.brightness} | files  # fmt: skip
+                  "brightness": brightness} | files  # fmt: skip
         options = [part for name, value in values.items() if value
                    for part in (f"--{name}", str(value))]  # fmt: skip
         names = [str(case.reference), *case.deformed]
@@ -394,8 +395,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         if result.shown == "contours":
             return numbers
         pair = self.pair(name)
-        gain, offset = (part.mean() for part in brightness(pair, u, self.case.brightness))
         f, material = pair.reference, pair.masks[0]
+        maps = brightness(pair, u, self.case.brightness)
+        gain, offset = (part[material].mean() for part in maps)
         moved = deformed_mask(self.grid, result.mesh, result.displacement, 0.0)
         noise_g = estimated_noise(pair.deformed, material if moved is None else moved).sd
         noise = float(np.hypot(estimated_noise(f, material).sd, gain * noise_g))
@@ -408,7 +410,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "warnings": [
                 *result.warnings,
                 *misfit_of(result, noise, f[material]),
-                *(uneven_light(pair, u) if self.case.brightness == 0 else ()),
+                *uneven_light(pair, u, self.case.brightness),
             ],
         }
 
@@ -429,7 +431,7 @@ def _mean_motion(result: NodalResult) -> dict[str, float]:
 def measure(
     reference: Path | str, deformed: Sequence[Path | str], folder: Path | str, *,
     mask: Path | str | None = None, pixel_size: float | None = None, mesh: Path | str | None = None,
-    brightness: int = 0, choice: FrameChoice | None = None, log: LogTable | None = None,
+    brightness: int = 1, choice: FrameChoice | None = None, log: LogTable | None = None,
     gauges: Path | str | None = None, progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
