@@ -482,6 +482,30 @@ def test_all_is_found_from_a_start_that_is_far_off(off_px: float, wave_px: float
     assert np.linalg.norm(error, axis=1).max() < 1.0
 
 
+@pytest.mark.parametrize(("half", "px"), [((0.45, 0.3), 0.1), ((0.3, 0.25), 0.2)])
+def test_a_small_specimen_in_a_large_picture_is_found(half: tuple[float, float], px: float) -> None:
+    """Blocks were as far apart as those of a whole picture, and compared with their own places."""
+    grid = PixelGrid.centred(360, 420, 0.01)
+
+    def u(points: np.ndarray) -> np.ndarray:
+        return points @ np.diag([0.02, -0.03]) + [0.013, 0.02]
+
+    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+    before, pattern = inverted(u, at, 1e-12), speckle(3, grid)
+    noise = 0.01 * np.random.default_rng(1).standard_normal((2, *grid.shape))
+    masks = [(abs(where - [-1.2, 1.0]) <= half).all(axis=-1) for where in (at, before)]
+    images = [
+        np.where(mask, pattern(where[..., 0], where[..., 1]), 0.0) + grain
+        for mask, where, grain in zip(masks, (at, before), noise, strict=True)
+    ]
+    body = FiniteElementOptions().body(masks[0], grid)
+    pair, nodes = ImagePair(*images, grid, masks[0]), body.mesh.nodes
+    start = block_motion(pair, body, 0.0 * nodes)
+    assert np.abs(start - u(nodes)).max() < 3.0 * grid.pixel_size
+    error = (displacement_from(start, pair, body).displacement - u(nodes)) / grid.pixel_size
+    assert np.sqrt(np.mean(error**2)) < px
+
+
 def test_light_that_changes_along_the_image_does_not_enter_the_displacement() -> None:
     without, ignored, found = (
         np.sqrt(np.mean(error_from(2.0, 60.0, degree, light) ** 2))
