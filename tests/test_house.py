@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 171, 35_206
+MOST_MODULES, MOST_LINES = 171, 35_238
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -83,9 +83,9 @@ OWN_BOUNDS = {
     HOMOGENIZATION: (19, 3_806), OWN_CELLS: (7, 960), IDENTIFICATION: (19, 4_073),
     DESIGN: (6, 856),
     FIRST_TOUCH: (3, 350),
-    CONTOURS: (17, 4_362), SEQUENCES: (12, 2_804), EXPLORE: (2, 306), SHARED_DATA: (3, 451),
-    GAUGES_AND_FORMATS: (9, 1_748),
-    WHOLE_DISPLACEMENT: (9, 2_330),
+    CONTOURS: (17, 4_370), SEQUENCES: (12, 2_908), EXPLORE: (2, 306), SHARED_DATA: (3, 451),
+    GAUGES_AND_FORMATS: (9, 1_757),
+    WHOLE_DISPLACEMENT: (9, 2_338),
 }  # fmt: skip
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 

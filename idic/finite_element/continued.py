@@ -24,7 +24,7 @@ from modeharvest.util.masks import grown
 
 _REACH_PX = 4
 """Distance beyond the material up to which pixels are continued by polynomials [px]."""
-_RIM_PX = 2
+_MIXED_PX = 2
 """Pixels along edges that may show some background, on masks found in photographs."""
 _SIGMA_PX = 1.5
 """Standard deviation of the Gaussian weights of the material's pixels for that."""
@@ -44,8 +44,8 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     inside, mask = pair.masks
     if level != FULL:
         # Background at the reference's edges, which g's mask leaves out, would move its corners.
-        rim = min(edge_px, _RIM_PX)
-        pure = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, rim))
+        margin = min(edge_px, _MIXED_PX)
+        pure = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, margin))
         covered = binned(pair.reference, inside, level.factor)[1] >= 0.5
         return replace(level_pair(pure, level, edge_px, order), mask=covered)
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
