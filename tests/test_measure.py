@@ -271,6 +271,25 @@ def test_material_is_found_and_lengths_are_pixels(
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
+def test_two_specimens_that_move_apart_are_not_strained(tmp_path: Path) -> None:
+    """The gap between them was taken for a strain: 3.3 % here."""
+    pattern = speckle(3, PixelGrid.centred(200, 200, 0.01))
+    y, x = 0.01 * np.mgrid[:130, :200]
+    for name, shift in (("ref", 0.0), ("a", 0.02)):
+        image = np.full(x.shape, 0.0)
+        for left, moved in ((0.15, -shift), (1.1, shift)):
+            at = x - moved
+            mask = (at > left) & (at < left + 0.75) & (y > 0.15) & (y < 1.15)
+            image = np.where(mask, pattern(at - 1.0, y - 0.65), image)
+            if name == "ref":
+                write_image(tmp_path / "mask.tif", image > 0.0)
+        write_image(tmp_path / f"{name}.tif", image.astype(np.float32))
+    summary = measure(tmp_path / "ref.tif", [tmp_path / "a.tif"], tmp_path / "out",
+                      mask=tmp_path / "mask.tif")  # fmt: skip
+    assert abs(summary["images"][0]["strain_x"]) < 2e-4
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_a_photograph_without_background_says_so(plate: Plate, tmp_path: Path) -> None:
     """One with a background as rough as speckle does, too, and is measured as a whole."""
     field = gaussian_filter(np.random.default_rng(0).standard_normal((150, 160)), 2.5)

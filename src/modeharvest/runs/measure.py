@@ -25,6 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from modeharvest.fem.field import Mesh, plane_mesh, read_any_mesh, read_mesh, write_mesh
 from modeharvest.idic.chebyshev import Brightness
@@ -419,10 +421,16 @@ def _mean_motion(result: NodalResult) -> dict[str, float]:
     """Mean strain along the material's x and y [-], tension positive, and rotation [degrees].
 
     They are those of the affine motion that fits the nodal displacements; rotation gives no strain.
+    Parts of the material that don't hang together may move apart, which gives none either.
     """
-    points = result.mesh.nodes
-    columns = np.column_stack([np.ones(len(points)), points])
-    F = np.eye(2) + np.linalg.lstsq(columns, result.displacement, rcond=None)[0][1:].T
+    cells, n = result.mesh.cells, len(result.mesh.nodes)
+    pairs = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
+    _, part = connected_components(csr_array((np.ones(cells.size), pairs), (n, n)), directed=False)
+    columns, motion = (
+        values - (np.array([np.bincount(part, c) for c in values.T]) / np.bincount(part)).T[part]
+        for values in (result.mesh.nodes, result.displacement)
+    )
+    F = np.eye(2) + np.linalg.lstsq(columns, motion, rcond=None)[0].T
     along, up = np.linalg.norm(F, axis=0) - 1.0
     turned = np.degrees(np.arctan2(F[1, 0] - F[0, 1], F[0, 0] + F[1, 1]))
     return {"strain_x": float(along), "strain_y": float(up), "rotation_deg": float(turned)}
