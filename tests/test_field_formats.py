@@ -115,6 +115,23 @@ def test_text_of_a_code_needs_no_declaration(tmp_path: Path, code: str) -> None:
     assert field.convention == convention
 
 
+@pytest.mark.parametrize("form", ["quoted", "whole numbers first", "UTF-16"])
+def test_decimal_commas_as_programs_in_german_write_them(tmp_path: Path, form: str) -> None:
+    """A comma in quotes, no sign in the first line of numbers, the encoding of Windows."""
+    rows = np.column_stack([np.ravel(c) for c in (COL, ROW, U_PX, V_DOWN, SIGMA)])
+    separator, mark = (",", '"') if form == "quoted" else (";", "")
+    text = [[f"{value:.12g}".replace(".", ",") for value in row] for row in rows]
+    if form == "whole numbers first":
+        text.insert(0, ["0", "0", "0", "0", "-1"])
+    table = [["x", "y", "u", "v", "sigma"], *text]
+    content = "\n".join(separator.join(f"{mark}{cell}{mark}" for cell in row) for row in table)
+    path = tmp_path / "vic.csv"
+    path.write_text(content, encoding="utf-16" if form == "UTF-16" else "utf-8")
+    field = read_field(path, GRID)
+    same(field.selected(np.arange(field.x.size) >= field.x.size - COL.size))
+    assert field.convention.startswith("VIC-2D: in px")
+
+
 def ncorr(scale: float) -> dict[str, FloatArray]:
     return {
         "plot_u_ref_formatted": scale * with_lost(U_PX, 0.0),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import tifffile
 from explored import content_of, quantity, samples
 from manufactured import inverted, speckle
 from plate_with_hole import GRID, plate_pair, quadratic_field
+from scipy.ndimage import gaussian_filter
 from summary_schemas import faults
 from test_cli import called, error_line
 
@@ -224,7 +226,7 @@ def no_numbers(
     plate: Plate, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[dict[str, Any], Path]:
     """Of a folder with an empty file, without a mask and a pixel size: summary and output."""
-    shots, out = tmp_path_factory.mktemp("shots"), tmp_path_factory.mktemp("no_numbers")
+    shots, out = tmp_path_factory.mktemp("Prüfung (3)"), tmp_path_factory.mktemp("no numbers")
     (shots / "a.tif").write_bytes((plate.folder / "a.tif").read_bytes())
     (shots / "b.tif").touch()
     return measure(plate.folder / "ref.tif", [shots], out), out
@@ -233,10 +235,25 @@ def no_numbers(
 def test_an_empty_file_in_a_folder_is_skipped_and_the_rest_goes_on(
     no_numbers: tuple[dict[str, Any], Path],
 ) -> None:
-    summary, _ = no_numbers
+    summary, out = no_numbers
     (image,), (skipped,) = summary["images"], summary["skipped"]
     assert (image["name"], skipped["name"]) == ("a", "b")
+    command = shlex.split(summary["command"])
+    assert command[-3:] == [str(Path(image["file"]).parent), "--out", str(out)]
     assert "an empty file, cut short at 0 bytes" in skipped["reason"]
+
+
+def test_light_may_slope_by_default(plate: Plate, tmp_path: Path, undrawn_pictures: None) -> None:
+    """A lamp that has moved made errors of 0.1 px, a change of 2 % some without a warning."""
+    slope = 1.0 + 0.05 * np.linspace(-1.0, 1.0, GRID.cols)
+    image = np.clip(tifffile.imread(plate.files[0]) * slope, 0, 255).astype(np.uint8)
+    write_image(tmp_path / "a.tif", image)
+    summary = measure(plate.folder / "ref.tif", [tmp_path / "a.tif"], tmp_path / "out",
+                      mask=plate.folder / "mask.tif")  # fmt: skip
+    assert summary["images"][0]["warnings"] == []
+    u = read_result(tmp_path / "out/results/a.h5").displacement_on()
+    error = (u - plate.truth["a"] / GRID.pixel_size)[plate.mask]
+    assert np.sqrt(np.nanmean(error**2)) < 0.03
 
 
 def test_material_is_found_and_lengths_are_pixels(
@@ -249,8 +266,40 @@ def test_material_is_found_and_lengths_are_pixels(
     both = plate.mask & np.isfinite(error).all(axis=-1)
     assert both.sum() > 0.9 * plate.mask.sum()
     assert np.sqrt(np.mean(error[both] ** 2)) < 0.1
-    assert summary["unit"] == "px"
+    assert (summary["unit"], summary["mask"]) == ("px", "found by its speckle")
     assert image["coverage"] > 0.99
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_two_specimens_that_move_apart_are_not_strained(tmp_path: Path) -> None:
+    """The gap between them was taken for a strain: 3.3 % here."""
+    pattern = speckle(3, PixelGrid.centred(200, 200, 0.01))
+    y, x = 0.01 * np.mgrid[:130, :200]
+    for name, shift in (("ref", 0.0), ("a", 0.02)):
+        image = np.full(x.shape, 0.0)
+        for left, moved in ((0.15, -shift), (1.1, shift)):
+            at = x - moved
+            mask = (at > left) & (at < left + 0.75) & (y > 0.15) & (y < 1.15)
+            image = np.where(mask, pattern(at - 1.0, y - 0.65), image)
+            if name == "ref":
+                write_image(tmp_path / "mask.tif", image > 0.0)
+        write_image(tmp_path / f"{name}.tif", image.astype(np.float32))
+    summary = measure(tmp_path / "ref.tif", [tmp_path / "a.tif"], tmp_path / "out",
+                      mask=tmp_path / "mask.tif")  # fmt: skip
+    assert abs(summary["images"][0]["strain_x"]) < 2e-4
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_a_photograph_without_background_says_so(plate: Plate, tmp_path: Path) -> None:
+    """One with a background as rough as speckle does, too, and is measured as a whole."""
+    field = gaussian_filter(np.random.default_rng(0).standard_normal((150, 160)), 2.5)
+    image = (128 + 60 * np.tanh(field / field.std())).astype(np.uint8)
+    for name in ("ref", "a"):
+        write_image(tmp_path / f"{name}.tif", image)
+    summary = measure(tmp_path / "ref.tif", [tmp_path / "a.tif"], tmp_path / "out")
+    assert summary["mask"] == "the whole image, as no background was found"
+    assert summary["material_px"] == image.size
+    assert summary["images"][0]["max_px"] < 0.01
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
@@ -302,13 +351,22 @@ def test_what_does_not_match_is_reported(plate: Plate, tmp_path: Path) -> None:
     assert "the images don't match" in summary["images"][0]["warnings"][-1]
 
 
+@pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize(("share", "count"), [(0.01, 0), (0.03, 1)])
-def test_light_that_changes_along_the_material_is_reported(share: float, count: int) -> None:
+def test_light_that_changes_along_the_material_is_reported(
+    share: float, count: int, degree: int
+) -> None:
+    """A slope where gain and offset are constants, a spot where they are linear."""
     pair, _ = plate_and_body()
-    light = np.linspace(1.0 - share, 1.0 + share, GRID.cols)  # beside the material, too
+    across = np.linspace(-1.0, 1.0, GRID.cols)  # beside the material, too
+    light = 1.0 + share * (across if degree == 0 else 3.0 * across**2)
     assert pair.truth is not None
     lit = pair.with_images(pair.reference, light * pair.deformed)
-    assert len(uneven_light(lit, pair.truth.displacement)) == count
+    found = uneven_light(lit, pair.truth.displacement, degree)
+    assert len(found) == count
+    assert all(f"--brightness {degree + 1} or" in text for text in found)
+    slope = pair.with_images(pair.reference, (1.0 + 0.05 * across) * pair.deformed)
+    assert not uneven_light(slope, pair.truth.displacement, 1)
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
@@ -441,6 +499,30 @@ def test_all_is_found_from_a_start_that_is_far_off(off_px: float, wave_px: float
     assert np.isfinite(error).all()
     assert np.sqrt(np.mean(error**2)) < 0.06
     assert np.linalg.norm(error, axis=1).max() < 1.0
+
+
+@pytest.mark.parametrize(("half", "px"), [((0.45, 0.3), 0.1), ((0.3, 0.25), 0.2)])
+def test_a_small_specimen_in_a_large_picture_is_found(half: tuple[float, float], px: float) -> None:
+    """Blocks were as far apart as those of a whole picture, and compared with their own places."""
+    grid = PixelGrid.centred(360, 420, 0.01)
+
+    def u(points: np.ndarray) -> np.ndarray:
+        return points @ np.diag([0.02, -0.03]) + [0.013, 0.02]
+
+    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+    before, pattern = inverted(u, at, 1e-12), speckle(3, grid)
+    noise = 0.01 * np.random.default_rng(1).standard_normal((2, *grid.shape))
+    masks = [(abs(where - [-1.2, 1.0]) <= half).all(axis=-1) for where in (at, before)]
+    images = [
+        np.where(mask, pattern(where[..., 0], where[..., 1]), 0.0) + grain
+        for mask, where, grain in zip(masks, (at, before), noise, strict=True)
+    ]
+    body = FiniteElementOptions().body(masks[0], grid)
+    pair, nodes = ImagePair(*images, grid, masks[0]), body.mesh.nodes
+    start = block_motion(pair, body, 0.0 * nodes)
+    assert np.abs(start - u(nodes)).max() < 3.0 * grid.pixel_size
+    error = (displacement_from(start, pair, body).displacement - u(nodes)) / grid.pixel_size
+    assert np.sqrt(np.mean(error**2)) < px
 
 
 def test_light_that_changes_along_the_image_does_not_enter_the_displacement() -> None:

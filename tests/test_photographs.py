@@ -54,6 +54,21 @@ def test_grey_levels_stay_counts_and_their_bits_are_found(tmp_path: Path, bits: 
     assert not any("Colour" in note for note in photograph.notes)
 
 
+@pytest.mark.parametrize("response", [(0.95, 1.0, 0.9), (0.6, 1.0, 0.5)])
+def test_a_raw_image_of_a_colour_camera_is_one_line(
+    tmp_path: Path, response: tuple[float, float, float]
+) -> None:
+    """Its pixels of three colours were taken for speckle, which doesn't move."""
+    levels = 255 * speckle(size=3.0)
+    tifffile.imwrite(tmp_path / "grey.tif", levels.astype(np.uint8))
+    red, green, blue = response
+    colours = np.tile([[red, green], [green, blue]], (48, 64))
+    tifffile.imwrite(tmp_path / "raw.tif", (colours * levels).astype(np.uint8))
+    assert read_photograph(tmp_path / "grey.tif").bits == 8
+    with pytest.raises(InputError, match=r"raw\.tif, got a colour camera's raw image"):
+        read_photograph(tmp_path / "raw.tif")
+
+
 @pytest.mark.parametrize("kind", ["png", "tif"])
 @pytest.mark.parametrize("bits", [8, 16])
 def test_lossless_formats_agree(tmp_path: Path, kind: str, bits: int) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 from synthetic_photographs import Photographed, lattice_points, of
 
 from modeharvest.idic.ansatz import Ansatz
@@ -181,6 +184,42 @@ def test_frames_of_a_video(tmp_path: Path, kind: str) -> None:
     assert [path.stat().st_mtime_ns for path in found.deformed] == stamps  # finished before
 
 
+@pytest.mark.parametrize("kind", ["mp4", "mkv"])
+def test_a_video_at_unequal_times_has_every_frame_once(tmp_path: Path, kind: str) -> None:
+    """As telephones film: to keep a rate, frames were repeated, and as many at the end left out."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    late = "setpts=(N+4*gte(N\\,2))/(4*TB)"  # a second passes after the second frame
+    subprocess.run(
+        [ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", film(tmp_path / "even.mp4", 6), "-vf", late,
+         "-crf", "1", tmp_path / f"test.{kind}"], check=True,
+    )  # fmt: skip
+    path = f"test.{kind}"
+    found = chosen_frames(tmp_path, path, [path], FrameChoice(), LogTable(), tmp_path / "out")
+    levels = [np.asarray(Image.open(path)).mean() for path in (found.reference, *found.deformed)]
+    assert levels == pytest.approx([20, 30, 40, 50, 60, 70], abs=2.0)
+    times = [known["time_s"] for known in found.recorded.values()]
+    assert times == pytest.approx([0.25, 1.5, 1.75, 2.0, 2.25], abs=0.01)
+    assert any("at unequal times" in note for note in found.notes)
+
+
+def test_a_video_compressed_to_mush_is_one_line(tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    noise = np.random.default_rng(0).normal(128.0, 20.0, (8, 64, 96))
+    for quality in (1, 28):
+        stream = ffmpeg.write_frames(
+            str(tmp_path / f"crf{quality}.mp4"), (96, 64), pix_fmt_in="gray", codec="libx264",
+            output_params=["-crf", f"{quality}"], macro_block_size=1, ffmpeg_log_level="error",
+        )  # fmt: skip
+        stream.send(None)
+        for image in gaussian_filter(noise, (0, 2, 2)):  # speckle of 7 px
+            stream.send(np.clip(128 + 10 * (image - 128), 0, 255).astype(np.uint8))
+        stream.close()
+    assert len(Video.of(tmp_path / "crf1.mp4").about()) == 1
+    assert re.match(
+        r"crf28\.mp4 is compressed to 0\.\d", Video.of(tmp_path / "crf28.mp4").about()[1]
+    )
+
+
 def test_a_reference_inside_a_video(tmp_path: Path) -> None:
     film(tmp_path / "test.mp4", 6)
     found = chosen_frames(
@@ -260,6 +299,21 @@ def test_columns_are_named_where_they_are_not_known(tmp_path: Path) -> None:
         read_log(path, LogTable("log.csv"))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Zeit [s];Kraft [N]\n0,5;1.000\n1,5;2.000\n",
+        "Time [s];Force [N]\n0.5;1,000\n1.5;2,000\n",
+        '"Time","Force"\n"(s)","(N)"\n"0.5","1,000"\n"1.5","2,000"\n',
+        '"Zeit","Kraft"\n"(s)","(N)"\n"0,5","1.000,0"\n"1,5","2.000,0"\n',
+    ],
+)
+def test_thousands_are_no_fractions(tmp_path: Path, text: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    log = read_log(tmp_path / "log.csv", LogTable("log.csv"))
+    assert (list(log.time), list(log.force)) == ([0.5, 1.5], [1000.0, 2000.0])
+
+
 def stamped(base: Path, hour: int = 10) -> Path:
     return folder_of(base / "shots", [f"c_20260301_{hour}000{s}" for s in range(4)])
 
@@ -283,6 +337,30 @@ def test_another_time_zone_is_found_and_reported(tmp_path: Path) -> None:
     forces = [known["force_N"] for known in found.recorded.values()]
     assert forces == pytest.approx([0, 2.5, 5, 1007.5])
     assert any("-2 h ahead" in note and "time zone" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [("Time", "2026-03-01T10:{:02}:00"), ("Uhrzeit", "10:{:02}:00"),
+     ("Time", "03/01/2026 10:{:02}:00 AM"), ("Time", "10:{:02}:00 AM")],
+)  # fmt: skip
+def test_photographs_from_before_the_log_are_in_its_time_zone(
+    tmp_path: Path, head: str, row: str
+) -> None:
+    """A quarter of an hour later all of them would be within the log."""
+    rows = [f"{row.format(minute)};{minute}" for minute in range(60)]
+    (tmp_path / "log.csv").write_text("\n".join([f"{head};Force [N]", *rows]))
+    folder_of(tmp_path / "shots", [f"c_20260301_{t}00" for t in ("0955", "1005", "1010", "1030")])
+    found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
+    assert [known["force_N"] for known in found.recorded.values()] == [None, 5.0, 10.0, 30.0]
+    assert not any("time zone" in note for note in found.notes)
+
+
+def test_a_log_without_dates_goes_on_after_midnight(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("Time;Force [N]\n23:59:50;1\n00:00:00;2\n00:00:10;3\n")
+    folder_of(tmp_path / "shots", ["c_20260301_235950", "c_20260302_000005"])
+    found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
+    assert [known["force_N"] for known in found.recorded.values()] == [1.0, 2.5]
 
 
 def test_an_offset_may_be_given_and_what_was_not_logged_has_no_force(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.idic.solver.pyramid import FELT, FULL, Level, LevelPair, eroded, level_pair
+from modeharvest.idic.solver.pyramid import FELT, FULL, Level, LevelPair, binned, eroded, level_pair
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage, border_reach
 from modeharvest.util.arrays import BoolArray, FloatImage
@@ -24,6 +24,8 @@ from modeharvest.util.masks import grown
 
 _REACH_PX = 4
 """Distance beyond the material up to which pixels are continued by polynomials [px]."""
+_MIXED_PX = 2
+"""Pixels along edges that may show some background, on masks found in photographs."""
 _SIGMA_PX = 1.5
 """Standard deviation of the Gaussian weights of the material's pixels for that."""
 _WINDOW_PX = 6
@@ -38,16 +40,21 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     """Make one level of an image pair; on the finest, g is continued by quadratic polynomials.
 
     pair, level : as for :func:`modeharvest.idic.solver.pyramid.level_pair`.
-    edge_px : pixels closer than this to the mask's edge are left out on the finest level [px].
+    edge_px : pixels closer than this to the mask's edge are left out on the finest level [px]; on
+        others, up to 2 px from the edge, those farther inside are continued in their place.
     order : of the spline that samples g.
     """
+    inside, mask = pair.masks
     if level != FULL:
-        coarse = level_pair(pair, level, edge_px, order)
-        within = np.zeros(coarse.mask.shape, np.bool_)
+        # Background at the reference's edges, which g's mask leaves out, would move its corners.
+        margin = min(edge_px, _MIXED_PX)
+        pure = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, margin))
+        covered = binned(pair.reference, inside, level.factor)[1] >= 0.5
+        within = np.zeros(covered.shape, np.bool_)
         width = round(min(_BLURS * level.blur, _MOST * min(within.shape)))
         within[width : within.shape[0] - width, width : within.shape[1] - width] = True
-        return replace(coarse, mask=coarse.mask & within, valid=within)
-    inside, mask = pair.masks
+        coarse = level_pair(pure, level, edge_px, order)
+        return replace(coarse, mask=covered & within, valid=within)
     valid = ndimage.binary_dilation(eroded(mask, max(0, edge_px - 1)))
     g, inside = continued_spline(pair.deformed, mask, order), eroded(inside, edge_px)
     return LevelPair(pair.grid, pair.reference, g, inside, None if valid.all() else valid)

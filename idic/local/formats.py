@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from modeharvest.idic.local.tables import TEXTS, Table, read_mat, read_table
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import open_hdf5
+from modeharvest.util.files import encoding_of, open_hdf5
 
 _LENGTHS = {"px": "px", "pixel": "px", "mm": "mm"}  # in files of DaVis
 _CSV_PX = {"x": "column", "y": "row", "u": "u [px]", "v": "v up [px]", "sd_u": "sd_u [px]",
@@ -187,7 +187,7 @@ def _davis(path: Path, table: Table, units: str | None, y_axis: str | None) -> K
     """A first line #DaVis 8.4.0 2D-vector STEP ROWS COLS "" "UNIT" "" "UNIT" "NAME" "UNIT"."""
     if path.suffix.lower() not in TEXTS or len(table) < 4:
         return None
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
+    with path.open(encoding=encoding_of(path), errors="replace") as file:
         line = file.readline().strip()
     if not re.match(r"#\w+ [\w.]+ 2D-vector ", line):
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import read_any_mesh
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import open_hdf5, read_in_child, reading, require_plausible
+from modeharvest.util.files import encoding_of, open_hdf5, read_in_child, reading, require_plausible
 from modeharvest.util.machine import require_memory
 
 Table = dict[str, FloatArray]
@@ -64,7 +65,7 @@ def _read_text(path: Path) -> Table:
     first = next((i for i, (_, line) in enumerate(numbered) if _looks_numeric(line)), None)
     if first is None:
         raise InputError(f"{path}: expected lines of numbers, found none")
-    separator, decimal = _dialect(numbered[first][1])
+    separator, decimal = _dialect(*(line for _, line in numbered[first:]))
     names = _split(numbered[first - 1][1], separator) if first else []
     while names and not names[-1]:
         names.pop()  # due to a separator at the end of the line
@@ -79,7 +80,7 @@ def _read_text(path: Path) -> Table:
 
 def _numbered(path: Path, begin: int = 1, end: int | None = _HEAD) -> list[tuple[int, str]]:
     """Numbers and contents of the lines that aren't empty, from ``begin`` to ``end``."""
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
+    with path.open(encoding=encoding_of(path), errors="replace") as file:
         lines = islice(enumerate(file, start=1), begin - 1, end)
         stripped = ((k, line.strip().lstrip("#%").strip()) for k, line in lines)
         return [(k, line) for k, line in stripped if line]
@@ -90,7 +91,7 @@ def _numbers_at_once(path: Path, begin: int, separator: str | None) -> FloatArra
     try:
         return np.loadtxt(
             path, delimiter=separator, comments=None, skiprows=begin - 1, ndmin=2,
-            encoding="utf-8-sig",
+            encoding=encoding_of(path),
         )  # fmt: skip
     except ValueError:  # words, gaps, decimal commas, or lines of different lengths
         return None
@@ -116,18 +117,26 @@ def _looks_numeric(line: str) -> bool:
     return numbers >= 2 and all(_is_number(f, decimal) or f.lower() in others for f in fields)
 
 
-def _dialect(line: str) -> tuple[str | None, str]:
-    """Separator (None: blanks) and decimal sign of a line of numbers."""
-    if ";" in line:
-        return ";", "," if "," in line else "."
-    if "\t" in line:
-        return "\t", "," if "," in line and "." not in line else "."
-    return ("," if "," in line else None), "."
+def _dialect(line: str, *more: str) -> tuple[str | None, str]:
+    """Separator (None: blanks) and decimal sign of lines of numbers; the first may have no sign."""
+    separator = next((sign for sign in ";\t," if sign in line), None)
+    if separator == "," and '"' not in line:
+        return separator, "."
+    for text in (line, *more) if separator else ():
+        fields = "".join(_split(text, separator))
+        if "," in fields or "." in fields:
+            return separator, "." if "." in fields else ","
+    return separator, "."
 
 
 def _split(line: str, separator: str | None) -> list[str]:
     # Blanks separate, except before a unit: x [mm].
-    fields = re.split(r"\s+(?!\[)", line) if separator is None else line.split(separator)
+    if separator is None:
+        fields = re.split(r"\s+(?!\[)", line)
+    elif '"' in line:  # a quoted field may hold the separator: "0,5","1,5"
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    else:
+        fields = line.split(separator)
     return [f.strip().strip("\"'").strip() for f in fields]
 
 

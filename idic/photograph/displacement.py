@@ -61,8 +61,9 @@ _SMOOTHER_FROM, _SMOOTHED_OVER, _LESS_SMOOTH = 0.75, 4.0, 2.0
 """Ratio of cut-off to shortest wave of the initial guess from which on a smoother one is tried, and
 over how many cut-offs that one is smoothed; over how many if the images then require a shorter
 cut-off (over one, errors of smooth waves are 1.4 times their standard deviation)."""
-_STRAY = 8.0
-"""Largest difference of a block's motion from its neighbours' median, over their spread."""
+_STRAY, _NEIGHBOURS = 8.0, 8
+"""Largest difference of a block's motion from its neighbours' median, over their spread; and how
+many neighbours these are."""
 _FIRST = FiniteElementOptions(edge_px=4)
 """Options of the measurement from which only the deformed image's mask is taken."""
 _LAST = FiniteElementOptions(edge_px=1)
@@ -166,6 +167,8 @@ def block_motion(
     known = known + slow(mesh.nodes)
     for times in _DENSER:
         dense = _matched(pair, mesh, known, times * BLOCKS)
+        if dense.found.sum() <= _NEIGHBOURS:  # too few to be compared
+            break
         left = dense.in_mm(pair.grid).less(_at_nearest(mesh, known))
         if np.quantile(np.linalg.norm(left.u, axis=1), 0.9) < _CLOSE_PX * pair.grid.pixel_size:
             break
@@ -181,7 +184,7 @@ def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:
     The normalised median test of J. Westerweel, F. Scarano, Exp. Fluids 39 (2005), doi
     10.1007/s00348-005-0016-6.
     """
-    around = blocks.u[cKDTree(blocks.points).query(blocks.points, k=9)[1][:, 1:]]
+    around = blocks.u[cKDTree(blocks.points).query(blocks.points, k=1 + _NEIGHBOURS)[1][:, 1:]]
     median = np.median(around, axis=1)
     spread = np.median(np.linalg.norm(around - median[:, None], axis=-1), axis=1)
     off = np.linalg.norm(blocks.u - median, axis=1)
@@ -218,7 +221,7 @@ def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
     """Make brightness and contrast of the pair equal, in the reference's levels; u (n, 2) [mm]."""
     at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
     gain, offset = brightness(pair, np.moveaxis(at, 0, -1), degree)
-    a, b = gain.mean(), offset.mean()
+    a, b = (part[pair.masks[0]].mean() for part in (gain, offset))
     reference = a * (pair.reference - offset) / gain + b
     return pair.with_images(reference.astype(np.float32), a * pair.deformed + b)
 
@@ -250,7 +253,7 @@ def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatAr
         off = np.abs(left - basis @ offset)
         there = off <= _UNLIKE * np.nanmedian(off)
     a, b = (field.evaluate(part, grid.x[None], grid.y[:, None]) for part in (gain, offset))
-    return np.maximum(a, _LEAST * a.mean()), b
+    return np.maximum(a, _LEAST * a[pair.masks[0]].mean()), b
 
 
 def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
@@ -263,15 +266,19 @@ def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
     return found
 
 
-def uneven_light(pair: ImagePair, u: FloatArray) -> tuple[str, ...]:
-    """Warn if the light changed differently over the material; ``u`` (rows, cols, 2) [mm]."""
-    mask, maps = pair.masks[0], brightness(pair, u, 1)
-    gain, offset = (part[mask] for part in maps)
-    level = (float(pair.reference[mask].mean()) - offset) / gain
-    change = float(np.ptp(level) / abs(level.mean()))
+def uneven_light(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[str, ...]:
+    """Warn if the light changed over the material otherwise than by polynomials of a degree.
+
+    ``u`` (rows, cols, 2) [mm].
+    """
+    mask, typical = pair.masks[0], float(pair.reference[pair.masks[0]].mean())
+    maps = (brightness(pair, u, of) for of in (degree, degree + 1))
+    level, finer = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
+    change = float(np.ptp(finer - level) / abs(finer.mean()))
     text = (
         f"The light changed along the material, by {100 * change:.0f} %, which is taken for "
-        "displacement: measure with --brightness 1 or 2, harvest with gain_degree 1 or 2."
+        f"displacement: measure with --brightness {degree + 1} or {degree + 2}, harvest with "
+        f"gain_degree {degree + 1} or {degree + 2}."
     )
     return (text,) * (change > _UNEVEN)
 

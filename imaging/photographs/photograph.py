@@ -32,9 +32,12 @@ _BLOCK_PX, _BLOCKY = 8, 1.5
 """Edge of the compression blocks [px]; ratio of steps between blocks to those within, above which
 blocks are reported: at most 1.2 without compression, 1.5 to 2.8 for JPEG of quality 50."""
 _MUSH = (
-    "Compression shows, as blocks of 8 x 8 px: errors are larger than error bars, which don't know "
-    "of it; save photographs as TIFF or PNG, or as JPEG of quality 95."
+    "Compression shows, as blocks of 8 x 8 px: it makes errors larger, of which error bars of "
+    "modes don't know; save photographs as TIFF or PNG, or as JPEG of quality 95."
 )
+_MOSAIC, _SURE = 0.3, 6.0
+"""Mean alternation of grey levels in blocks of 2 x 2 px, over its standard deviation, above which
+an image is a raw mosaic of colours; and the least number of standard errors of that mean."""
 _OTHER_SCALE = 4.0
 """Ratio of two frames' bright levels from which on their bit depths must differ."""
 
@@ -78,7 +81,8 @@ def read_photograph(path: Path | str) -> Photograph:
 
     The first page of a multi-page file is read and the orientation tag applied, which ``notes``
     records. InputError, in one line that names the file, if it is missing, damaged, has no grey or
-    colour levels, holds NaN or infinity, or every pixel has the same level.
+    colour levels, holds NaN or infinity, every pixel has the same level, or neighbouring pixels
+    show different colours.
     """
     stored = files.read_stored(Path(path))
     files.require_grey_levels(stored.levels, path)
@@ -88,6 +92,12 @@ def read_photograph(path: Path | str) -> Photograph:
     with np.errstate(over="ignore"):  # infinite values are refused later
         image = np.ascontiguousarray(files.luma(levels.astype(np.float32)))
     files.require_visible(image, f"at {path}")
+    if levels.ndim == 2 and is_mosaic(image):
+        raise InputError(
+            f"expected grey levels or colour at {path}, got a colour camera's raw image, whose "
+            "neighbouring pixels are red, green and blue; convert it to colour with the camera's "
+            "program"
+        )
     bits, full_scale = _scale(levels)
     saturated, black = _cut_off(levels, full_scale)
     notes = list(stored.notes)
@@ -188,6 +198,15 @@ def shows_blocks(image: FloatImage) -> bool:
         if max(typical) <= _BLOCKY * float(np.median(typical)):
             return False
     return True
+
+
+def is_mosaic(image: FloatImage) -> bool:
+    """Whether an image (rows, cols) is a colour camera's raw one: green pixels alternate."""
+    rows, cols = (size // 2 * 2 for size in image.shape)
+    top, bottom = image[:rows:2, :cols], image[1:rows:2, :cols]
+    alternating = (top - bottom)[:, ::2] - (top - bottom)[:, 1::2]
+    least = max(_MOSAIC, _SURE / np.sqrt(max(alternating.size, 1)))
+    return bool(alternating.size and abs(alternating.mean()) > least * alternating.std())
 
 
 def _other_depth(reference: Photograph, frame: Photograph) -> str:

@@ -21,7 +21,7 @@ from modeharvest.util.errors import InputError, MissingDependencyError
 from modeharvest.util.files import require_file
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".webm", ".wmv")
-PICTURES = (".tif", ".tiff", ".png", ".jpg", ".jpeg")
+PICTURES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp")
 HOW_TO_GET = "videos are read by imageio-ffmpeg: install it with 'pip install imageio-ffmpeg'"
 _DATE = re.compile(
     r"(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_.T ]*([0-2]\d)[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)"
@@ -159,30 +159,68 @@ class Video:
     """A video file, not decoded yet."""
 
     path: Path
-    count: int
-    """Number of frames, as counted by ffmpeg without decoding them."""
-    rate: float
-    """Frames per second."""
+    times: tuple[float, ...]
+    """Times of the frames since the first [s], of the file's packets, without decoding them."""
+    bits_per_pixel: float
+    """Size of the packets over the number of pixels of all frames [bit]."""
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return len(self.times)
+
+    @property
+    def rate(self) -> float:
+        """Frames per second, on average."""
+        return (self.count - 1) / self.times[-1] if self.count > 1 else 1.0
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether its frames follow each other at equal times; those of telephones don't."""
+        steps = np.diff(self.times)
+        return bool(steps.size == 0 or np.ptp(steps) < np.median(steps))
 
     @classmethod
     def of(cls, path: Path) -> Video:
         """Open a video; raises InputError if it isn't one, or ffmpeg finds no frames in it."""
         require_file(path, "a video", _REMEDY)
         copied = subprocess.run(
-            [_ffmpeg(), "-nostdin", "-i", str(path), "-map", "0:v:0", "-c", "copy", "-f", "null",
-             "-"], capture_output=True, text=True, errors="replace", check=False,
-        ).stderr  # fmt: skip
-        counts = re.findall(r"frame= *(\d+)", copied)
-        rate = re.search(r"([\d.]+) fps", copied) or re.search(r"([\d.]+) tbr", copied)
-        if not counts or not int(counts[-1]) or not rate:
-            last = (copied.strip().splitlines() or ["no word"])[-1].strip()
+            [_ffmpeg(), "-nostdin", "-i", str(path), "-map", "0:v:0", "-c", "copy", "-f",
+             "framecrc", "-"], capture_output=True, text=True, errors="replace", check=False,
+        )  # fmt: skip
+        packets = [line.split(",") for line in copied.stdout.splitlines() if line[:1] == "0"]
+        base = re.search(r"^#tb 0: (\d+)/(\d+)", copied.stdout, re.MULTILINE)
+        rate = re.search(r"([\d.]+) fps", copied.stderr) or re.search(
+            r"([\d.]+) tbr", copied.stderr
+        )
+        size = re.search(r"Video: .*?, (\d+)x(\d+)", copied.stderr)
+        if not packets or not base or not rate or not size:
+            last = (copied.stderr.strip().splitlines() or ["no word"])[-1].strip()
             raise InputError(f"expected a video at {path}, ffmpeg says: {last:.100}; {_REMEDY}")
-        return cls(path, int(counts[-1]), float(rate[1]))
+        stamps = np.sort([int(packet[2]) for packet in packets])
+        times = (stamps - stamps[0]) * int(base[1]) / int(base[2])
+        if stamps[0] == _UNKNOWN or not np.all(np.diff(stamps)):
+            times = np.arange(len(packets)) / float(rate[1])
+        bits = 8 * sum(int(packet[4]) for packet in packets)
+        pixels = len(packets) * int(size[1]) * int(size[2])
+        return cls(path, tuple(times.tolist()), bits / pixels)
+
+    def about(self) -> tuple[str, ...]:
+        """Texts about its frames, and on what increases errors."""
+        steady = "" if self.is_steady else ", at unequal times, which are read from it"
+        text = f"{self.path.name}: {self.count} frames, {self.rate:.4g} a second{steady}."
+        if self.bits_per_pixel >= _FEW_BITS:
+            return (text,)
+        return text, (
+            f"{self.path.name} is compressed to {self.bits_per_pixel:.2g} bits a pixel, less than "
+            "a camera's noise has: errors are larger than error bars say; film with less "
+            "compression, best with none."
+        )
 
     def frame(self, number: int) -> SequenceFrame:
         """The frame with a given number, from 0."""
         name = f"{self.path.stem}_{number:06d}"
-        return SequenceFrame(name, self.path, number, number / self.rate)
+        return SequenceFrame(name, self.path, number, self.times[number])
 
     def levels(self, wanted: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Decode the wanted frames: yield each number, from 0, and its grey levels (rows, cols).
@@ -190,7 +228,9 @@ class Video:
         Frames after a damaged one, or beyond the video's end, are not yielded.
         """
         left = set(wanted)
+        # At times of our own: to keep a rate, ffmpeg would repeat frames and leave out others.
         command = [_ffmpeg(), "-nostdin", "-v", "quiet", "-i", str(self.path), "-map", "0:v:0",
+                   "-vf", "settb=1/25,setpts=N,fps=25",
                    "-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"]  # fmt: skip
         with subprocess.Popen(command, stdout=subprocess.PIPE) as decoder:
             assert decoder.stdout
@@ -207,6 +247,10 @@ class Video:
                 decoder.kill()
 
 
+_FEW_BITS = 1.0
+"""Bits a pixel below which a video is reported: as many as noise of a quarter of a level has."""
+_UNKNOWN = -(2**63)
+"""ffmpeg's time stamp of a packet without one."""
 _REMEDY = "convert it, best to single TIFF images, or export it again"
 
 

@@ -43,6 +43,8 @@ REACH_PX = 24
 """Largest distance of a block from where it is expected, along rows and along columns."""
 TURNS_DEG = (0.0, -12.0, 12.0, -24.0, 24.0)
 """Rotations of blocks that are tried [degrees]: junctions between buckling holes turn that much."""
+_SPARSE = 0.25
+"""Share of material in an image below which blocks are closer to each other, to be enough."""
 _SAME = 0.5
 """Share of blocks that must be found."""
 _CLEAR = 0.1
@@ -120,7 +122,11 @@ def match_blocks(
     # Some of many blocks suffice for the correlation by chance.
     some = range(0, len(aims), max(1, len(aims) // BLOCKS))
     elsewhere = np.roll(aims, len(aims) // 2, axis=0)
-    decoys = [_search(g, blocks[i], elsewhere[i], reach_px) for i in some]
+    is_near = (abs(elsewhere - aims) <= 2 * reach_px).all(axis=1)  # there mirror images are not
+    decoys = [
+        _search(g, blocks[i][..., ::-1] if is_near[i] else blocks[i], elsewhere[i], reach_px)
+        for i in some
+    ]
     return BlockMatch(
         before=centres.astype(np.float64),
         after=np.array([place for place, _ in there], dtype=np.float64),
@@ -145,7 +151,7 @@ def require_same_surface(
 def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
     """(centres (n, 2), half an edge) of blocks on material, spread over the image."""
     room = room_around(material)
-    cell = max(8, int(np.sqrt(material.size / count)))
+    cell = max(8, int(np.sqrt(min(material.size, material.sum() / _SPARSE) / count)))
     rows, cols = (n // cell for n in material.shape)
     tiles = room[: rows * cell, : cols * cell].reshape(rows, cell, cols, cell).swapaxes(1, 2)
     flat = tiles.reshape(rows, cols, -1)

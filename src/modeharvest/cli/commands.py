@@ -264,7 +264,7 @@ def measure(
     ] = None,
     brightness: Annotated[
         int, typer.Option(help="Degree of the polynomials of gain and offset over x, y: 0 to 6.")
-    ] = 0,
+    ] = 1,
     every: Annotated[int, typer.Option(help="Measure only every N-th image.", metavar="N")] = 1,
     log: Annotated[
         Path | None, typer.Option(help="Log file of the testing machine, joined to images by time.")

@@ -24,6 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from modeharvest.fem.field import Mesh, plane_mesh, read_any_mesh, read_mesh, write_mesh
 from modeharvest.idic.chebyshev import Brightness
@@ -109,7 +111,7 @@ class MeasureCase:
     mask: Path | None = None
     pixel_size: float | None = None
     mesh: Path | None = None
-    brightness: int = 0
+    brightness: int = 1
     sequence: ChosenFrames | None = None
     choice: tuple[str, ...] = ()
     gauges: Path | None = None
@@ -345,7 +347,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "command": command_line("measure", case.reference, *case.deformed, *(
                 word for option, value in (
                     ("--mask", case.mask), ("--pixel-size", case.pixel_size), ("--mesh", case.mesh),
-                    ("--brightness", case.brightness or None), ("--gauges", case.gauges),
+                    ("--brightness", case.brightness), ("--gauges", case.gauges),
                 ) if value is not None for word in (option, value)
             ), *case.choice, "--out", self.folder),
             "unit": case.unit,
@@ -353,6 +355,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "shape_px": list(self.grid.shape),
             "material_px": int(self.material.mask.sum()),
             "mask": "given" if not case.mask is case.mesh is None
+            else "the whole image, as no background was found" if self.material.mask.all()
             else "found by its speckle" if self.plain is None
             else "found by its grey level",
             "notes": [*self.reference.notes, *(case.sequence.notes if case.sequence else ())],
@@ -385,8 +388,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         if result.shown == "contours":
             return numbers
         pair = self.pair(name)
-        gain, offset = (part.mean() for part in brightness(pair, u, self.case.brightness))
         f, material = pair.reference, pair.masks[0]
+        maps = brightness(pair, u, self.case.brightness)
+        gain, offset = (part[material].mean() for part in maps)
         moved = deformed_mask(self.grid, result.mesh, result.displacement, 0.0)
         noise_g = estimated_noise(pair.deformed, material if moved is None else moved).sd
         noise = float(np.hypot(estimated_noise(f, material).sd, gain * noise_g))
@@ -399,7 +403,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "warnings": [
                 *result.warnings,
                 *misfit_of(result, noise, f[material]),
-                *(uneven_light(pair, u) if self.case.brightness == 0 else ()),
+                *uneven_light(pair, u, self.case.brightness),
             ],
         }
 
@@ -408,10 +412,16 @@ def _mean_motion(result: NodalResult) -> dict[str, float]:
     """Mean strain along the material's x and y [-], tension positive, and rotation [degrees].
 
     They are those of the affine motion that fits the nodal displacements; rotation gives no strain.
+    Parts of the material that don't hang together may move apart, which gives none either.
     """
-    points = result.mesh.nodes
-    columns = np.column_stack([np.ones(len(points)), points])
-    F = np.eye(2) + np.linalg.lstsq(columns, result.displacement, rcond=None)[0][1:].T
+    cells, n = result.mesh.cells, len(result.mesh.nodes)
+    pairs = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
+    _, part = connected_components(csr_array((np.ones(cells.size), pairs), (n, n)), directed=False)
+    columns, motion = (
+        values - (np.array([np.bincount(part, c) for c in values.T]) / np.bincount(part)).T[part]
+        for values in (result.mesh.nodes, result.displacement)
+    )
+    F = np.eye(2) + np.linalg.lstsq(columns, motion, rcond=None)[0].T
     along, up = np.linalg.norm(F, axis=0) - 1.0
     turned = np.degrees(np.arctan2(F[1, 0] - F[0, 1], F[0, 0] + F[1, 1]))
     return {"strain_x": float(along), "strain_y": float(up), "rotation_deg": float(turned)}
@@ -420,7 +430,7 @@ def _mean_motion(result: NodalResult) -> dict[str, float]:
 def measure(
     reference: Path | str, deformed: Sequence[Path | str], folder: Path | str, *,
     mask: Path | str | None = None, pixel_size: float | None = None, mesh: Path | str | None = None,
-    brightness: int = 0, choice: FrameChoice | None = None, log: LogTable | None = None,
+    brightness: int = 1, choice: FrameChoice | None = None, log: LogTable | None = None,
     gauges: Path | str | None = None, progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.

@@ -68,6 +68,12 @@ def require_file(path: Path, what: str, remedy: str) -> None:
         )
 
 
+def encoding_of(path: Path) -> str:
+    """Encoding of a text file: UTF-16 where it begins with that one's mark, else UTF-8."""
+    with path.open("rb") as file:
+        return "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+
+
 def reason(error: BaseException) -> str:
     """The message of a library's exception, in one line."""
     if isinstance(error, KeyError) and len(error.args) == 1 and " " not in str(error.args[0]):

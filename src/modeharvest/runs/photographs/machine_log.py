@@ -6,6 +6,7 @@ points or commas. Any lines may precede the heads; units are in the heads or in 
 
 from __future__ import annotations
 
+import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -16,11 +17,12 @@ import numpy as np
 
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within
-from modeharvest.util.files import reading
+from modeharvest.util.files import encoding_of, reading
 
 _NAMES = {
     "time": r"^(test|total|elapsed|laufende?|pr[uü]f)?[ _-]*(time|zeit|temps|tiempo|tempo|t"
-    r"|datetime|timestamp|time ?stamp|zeitpunkt|date[ _/&-]*time|datum[ _/&-]*zeit|clock|uhrzeit)$",
+    r"|datetime|timestamp|time ?stamp|zeitpunkt|zeitstempel|date[ _/&-]*time|datum[ _/&-]*zeit"
+    r"|clock|uhrzeit)$",
     "force": r"^(axial|standard|pr[uü]f|max\.?)?[ _-]*(force|load|kraft|last|fuerza|carga|forza"
     r"|f|fz|load ?cell|kraftmessdose)([ _-]*\d)?$",
     "crosshead": r"(crosshead|traverse|position|displacement|extension|stroke|standardweg|^weg$|"
@@ -39,10 +41,16 @@ _UNITS = {
 _HEAD = re.compile(
     r"^(.*?)[\s_]*(?:[\[(<]\s*([^\])>]*)\s*[\])>]|/\s*([a-zA-Zµμ]+)|\bin ([a-z]+))?$"
 )
+_THOUSANDS = r"[-+]?\d{{1,3}}(?:{0}\d{{3}})+(?:[.,]\d*)?"
+"""A number with separators of thousands, which are to be put in."""
 _EPOCH = 1e8
 """Numbers from this on are dates, in seconds since 1970 [s]."""
-_ZONE = 900.0
-"""Time zones differ by multiples of this [s]."""
+_ZONE, _HOUR, _DAY = 900.0, 3600.0, 86400.0
+"""Time zones differ by multiples of the first, mostly of the second; what a clock begins anew at
+[s]. Times like 01:00:00 are a clock's from an hour on, and count from the log's beginning before.
+"""
+_MOST = 0.5
+"""Share of the photographs that must have been taken while the log was written."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,8 @@ class MachineLog:
     """(n,) crosshead positions [mm]; None if not recorded."""
     text: tuple[str, ...]
     """How the log was read, as text for the report."""
+    is_clock: bool = False
+    """Whether its times are those of a day, without a date."""
 
     @property
     def is_dated(self) -> bool:
@@ -122,7 +132,7 @@ def read_log(path: Path, table: LogTable) -> MachineLog:
 
         at, date = found["time"] or 0, found["date"]
         stamps = [row[at] if date is None else f"{row[date]} {row[at]}" for row in body]
-        time = _times(stamps, decimal, _UNITS["time"].get(units[at], 1.0))
+        time, is_clock = _times(stamps, decimal, _UNITS["time"].get(units[at], 1.0))
         columns = [numbers("force"), numbers("crosshead")]
         keep = np.isfinite([time, *(c for c in columns if c is not None)]).all(axis=0)
         if keep.sum() < 2:
@@ -135,7 +145,7 @@ def read_log(path: Path, table: LogTable) -> MachineLog:
     if lost := len(body) - len(order):
         text.append(f"{path.name}: {lost} rows without numbers were left out.")
     force, crosshead = (None if c is None else c[order] for c in columns)
-    return MachineLog(time[order], force, crosshead, tuple(text))
+    return MachineLog(time[order], force, crosshead, tuple(text), is_clock)
 
 
 def offset_between(
@@ -143,27 +153,47 @@ def offset_between(
 ) -> tuple[float, tuple[str, ...]]:
     """What to add to the photographs' times (n,) [s] to get the log's, and how it was found.
 
-    The given offset, if any; else 0 if both have dates and overlap; else the time zone with which
-    they overlap; else the log is taken to begin with the first photograph.
+    The given offset, if any. Else, if both have dates, or the log times of the day, 0 if most
+    photographs were taken while it was written, else the time zone with which they were. Else the
+    log is taken to begin with the first photograph.
     """
     if given is not None:
         return given, (f"The log's clock is {given:+g} s ahead of the photographs', as given.",)
-    dated = times[0] > _EPOCH
-    if not dated or not log.is_dated:
-        begin = float(log.time[0] - times[0]) if dated or log.is_dated else 0.0
-        text = (
-            "The log is taken to begin with the first photograph, as only one of both has dates; "
-            "if that is wrong, give offset_s in [log]."
-        )
-        return begin, (text,) * bool(begin)
-    zones = _ZONE * np.array(sorted(range(-56, 57), key=abs))
-    first, last = log.time[[0, -1]] + (-1.0, 1.0)
+    dated, day = times[0] > _EPOCH, times[0] - times[0] % _DAY
+    if dated and log.is_clock:
+        zone, text = _zone(log.time + day, times)
+        if not np.isnan(zone):
+            note = (
+                "The log has times without dates: they are taken for those of the photographs' day."
+            )
+            return zone - day, (note, *text)
+    elif dated and log.is_dated:
+        zone, text = _zone(log.time, times)
+        return float(np.nan_to_num(zone)), text
+    has_origin = dated or log.is_dated or log.is_clock
+    begin = float(log.time[0] - times[0]) if has_origin else 0.0
+    note = (
+        "The log is taken to begin with the first photograph, as only one of both has dates; "
+        "if that is wrong, give offset_s in [log]."
+    )
+    return begin, (note,) * bool(begin)
+
+
+def _zone(log: FloatArray, times: FloatArray) -> tuple[float, tuple[str, ...]]:
+    """Time zone of a log's times minus that of the photographs' [s], NaN if none fits, and a text.
+
+    Photographs may have been taken before and after: the zones' order counts, not each one more.
+    """
+    zones = _ZONE * np.array(sorted(range(-56, 57), key=lambda k: (k * _ZONE % _HOUR > 0, abs(k))))
+    first, last = log[[0, -1]] + (-1.0, 1.0)
     shares = [np.mean((times + zone >= first) & (times + zone <= last)) for zone in zones]
-    zone = float(zones[int(np.argmax(shares))])  # the smallest of equally good ones
     if not max(shares):
-        return 0.0, ("No photograph was taken while the log was written; give offset_s in [log].",)
+        return np.nan, (
+            "No photograph was taken while the log was written; give offset_s in [log].",
+        )
+    zone = float(zones[int(np.argmax(np.minimum(shares, _MOST)))])  # the first that will do
     text = (
-        f"The log's clock is {zone / 3600:+g} h ahead of the photographs', as in another "
+        f"The log's clock is {zone / _HOUR:+g} h ahead of the photographs', as in another "
         "time zone; if that is wrong, give offset_s in [log]."
     )
     return zone, (text,) * bool(zone)
@@ -173,13 +203,10 @@ def offset_between(
 
 
 def _text(path: Path) -> str:
-    raw = path.read_bytes()
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return raw.decode("utf-16")
     try:
-        return raw.decode("utf-8-sig")
+        return path.read_text(encoding_of(path))
     except UnicodeDecodeError:
-        return raw.decode("latin-1")
+        return path.read_text("latin-1")
 
 
 def _rows(text: str) -> tuple[list[list[str]], list[list[str]], str]:
@@ -189,9 +216,9 @@ def _rows(text: str) -> tuple[list[list[str]], list[list[str]], str]:
     """
     lines = [line for line in text.splitlines() if line.strip()]
     best: tuple[list[list[str]], list[bool], str] = ([], [], ".")
-    for separator, decimal in ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."),
-                               (None, "."), (None, ",")):  # fmt: skip
-        rows = [[c.strip().strip('"') for c in line.split(separator)] for line in lines]
+    for separator in (";", "\t", ",", None):
+        rows = [_cells(line, separator) for line in lines]
+        decimal = "." if separator == "," and '"' not in text else _decimal(rows)
         good = [len(row) > 1 and _is_numeric(row, decimal) for row in rows]
         if sum(good) > sum(best[1]):
             best = rows, good, decimal
@@ -202,6 +229,21 @@ def _rows(text: str) -> tuple[list[list[str]], list[list[str]], str]:
     length = count.most_common(1)[0][0]
     first = next(i for i, row in enumerate(rows) if good[i] and len(row) == length)
     return rows[:first], [row for row in rows[first:] if len(row) == length], decimal
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    if separator and '"' in line:  # a quoted cell may hold the separator
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+    return [cell.strip().strip('"') for cell in line.split(separator)]
+
+
+def _decimal(rows: Sequence[Sequence[str]]) -> str:
+    """The decimal sign: of two signs the one that doesn't only separate thousands."""
+    cells = {cell for row in rows for cell in row if re.fullmatch(r"[-+−]?[\d.,']+", cell)}
+    points, commas = ({c for c in cells if np.isfinite(_number(c, s)) and s in c} for s in ".,")
+    if not points or not commas:
+        return "," if commas else "."
+    return "." if all(re.fullmatch(_THOUSANDS.format(","), cell) for cell in commas) else ","
 
 
 def _is_numeric(row: Sequence[str], decimal: str) -> bool:
@@ -218,7 +260,7 @@ def _number(cell: str, decimal: str) -> float:
     """The number in a cell, with or without thousands separators; NaN if it is none."""
     other = "," if decimal == "." else "."
     text = cell.replace("\u202f", "").replace("'", "").replace("−", "-")
-    if decimal in text and text.find(other) < text.find(decimal):
+    if re.fullmatch(_THOUSANDS.format(re.escape(other)), text):
         text = text.replace(other, "")
     try:
         return float(text.replace(decimal, "."))
@@ -259,18 +301,30 @@ def _column(role: str, heads: Sequence[str], given: str, path: Path) -> int | No
     return None
 
 
-def _times(stamps: Sequence[str], decimal: str, scale: float) -> FloatArray:
-    """(n,) times [s] since 1970, or since the log or the day began; NaN for rows without one."""
+def _times(stamps: Sequence[str], decimal: str, scale: float) -> tuple[FloatArray, bool]:
+    """(n,) times [s] since 1970, or since the log or the day began, NaN for rows without one.
+
+    Also whether they are times of a day; those after midnight belong to the next.
+    """
     import pandas as pd
 
     numbers = np.array([_number(stamp, decimal) for stamp in stamps])
     if np.isfinite(numbers).mean() > 0.5:
-        return np.asarray(scale * numbers)
+        return np.asarray(scale * numbers), False
     # Times are local: a time zone that is written with them is ignored.
     plain = [re.sub(r"(:\d\d),", r"\1.", re.sub(r"(Z|[+-]\d\d:?\d\d)$", "", s)) for s in stamps]
     times = pd.to_timedelta(pd.Series(plain), errors="coerce").dt.total_seconds()
+    halves = bool(re.search(r"[AP]M$", plain[0]))
     if times.isna().mean() > 0.5:
         iso = bool(re.match(r"\d{4}", plain[0]))
-        dates = pd.to_datetime(plain, format="mixed", dayfirst=not iso, errors="coerce")
+        # Where the day has two halves, months come first.
+        how = {"format": "mixed", "dayfirst": not iso and not halves, "errors": "coerce"}
+        has_date = len(re.findall(r"\d+", plain[0].partition(":")[0])) > 1
+        dates = pd.to_datetime(plain if has_date else [f"1970-01-01 {s}" for s in plain], **how)
         times = pd.Series((dates - pd.Timestamp(0)).total_seconds())
-    return np.asarray(times, np.float64)
+    seconds = np.array(times, np.float64)
+    known = np.isfinite(seconds)
+    is_clock = bool(known.any()) and _HOUR < seconds[known][0] < _DAY
+    if is_clock:
+        seconds[known] = np.unwrap(seconds[known], period=_DAY)
+    return seconds, is_clock

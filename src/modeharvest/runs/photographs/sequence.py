@@ -174,7 +174,7 @@ def _all_frames(
     for name in names:
         if is_video(name):
             video = Video.of(base / name)
-            notes.append(f"{video.path.name}: {video.count} frames, {video.rate:.4g} a second.")
+            notes += video.about()
             frames += map(video.frame, range(video.count))
             continue
         taken = {frame.name for frame in frames}
