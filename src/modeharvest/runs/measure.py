@@ -347,7 +347,8 @@ class MeasureRun(StagedRun[MeasureCase]):
             "command": command_line("measure", case.reference, *case.deformed, *(
                 word for option, value in (
                     ("--mask", case.mask), ("--pixel-size", case.pixel_size), ("--mesh", case.mesh),
-                    ("--brightness", case.brightness), ("--gauges", case.gauges),
+                    ("--brightness", None if case.brightness == 1 else case.brightness),
+                    ("--gauges", case.gauges),
                 ) if value is not None for word in (option, value)
             ), *case.choice, "--out", self.folder),
             "unit": case.unit,
