@@ -61,6 +61,8 @@ _SMOOTHER_FROM, _SMOOTHED_OVER, _LESS_SMOOTH = 0.75, 4.0, 2.0
 """Ratio of cut-off to shortest wave of the initial guess from which on a smoother one is tried, and
 over how many cut-offs that one is smoothed; over how many if the images then require a shorter
 cut-off (over one, errors of smooth waves are 1.4 times their standard deviation)."""
+_LOST = 0.1
+"""Share of nodes at which images don't match from which on even light is tried, too."""
 _STRAY, _NEIGHBOURS = 8.0, 8
 """Largest difference of a block's motion from its neighbours' median, over their spread; and how
 many neighbours these are."""
@@ -93,25 +95,33 @@ def displacement_from(
     overlap; and as for :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
     ``light_degree``: of the polynomials by which gain and offset vary over the reference.
     """
-    mesh, u = body.mesh, start
+    mesh = body.mesh
     is_sought = pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None
 
-    def seen(off_px: float) -> ImagePair:
+    def seen(u: FloatArray, off_px: float, degree: int) -> ImagePair:
         """The images, equally bright, without what shows background if edges are off this much."""
-        pair_alike = alike(pair, mesh, u, light_degree)
+        pair_alike = alike(pair, mesh, u, degree)
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(pair_alike, deformed_mask=mask)
 
-    unknown = len(start)
-    for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
-        u, known = coarse_displacement(seen(off_px), start, body, options=_FIRST)
-        # Where the images don't match, the next attempt starts from the neighbours' displacement.
-        start = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
-        before, unknown = unknown, int((~known).sum())
-        if sweep and not 0 < unknown < before:
-            break
+    def swept(degree: int) -> tuple[int, FloatArray, FloatArray]:
+        """Nodes at which the images don't match, a better start, and u."""
+        better, u, unknown = start, start, 0 if pair.deformed_mask is not None else len(start)
+        for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
+            u, known = coarse_displacement(seen(u, off_px, degree), better, body, options=_FIRST)
+            # Where the images don't match, the next one starts from the neighbours' displacement.
+            better = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
+            before, unknown = unknown, int((~known).sum())
+            if sweep and not 0 < unknown < before:
+                break
+        return unknown, better, u
+
+    found_start = swept(light_degree)
+    if light_degree and found_start[0] > _LOST * len(start):  # slopes adapt to a start far off
+        found_start = min(found_start, swept(0), key=lambda each: each[0])
+    _, start, u = found_start
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
-    pair_alike = seen(_AT_EDGE_PX)
+    pair_alike = seen(u, _AT_EDGE_PX, light_degree)
     found = measured(pair_alike, start)
     if found.cutoff_px is None or found.cutoff_px < _SMOOTHER_FROM * _SMOOTH_PX:
         return found
