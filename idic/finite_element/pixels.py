@@ -77,8 +77,8 @@ class MeshPixels:
         mesh = self.mesh
         located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the material")
         _require_cover(located.mask, mask, self.beyond)
-        flat = np.flatnonzero(mask & located.mask)
-        where, ones = (located.element.ravel()[flat], flat), np.ones(flat.size, np.int8)
+        places = np.flatnonzero(mask & located.mask)
+        where, ones = (located.element.ravel()[places], places), np.ones(places.size, np.int8)
         by_element = csr_array((ones, where), shape=(len(mesh.cells), mask.size))
         row, col = np.divmod(by_element.indices, grid.cols)
         xi = located.values.reshape(2, -1)[:, by_element.indices].astype(np.float32)
