@@ -173,9 +173,9 @@ def of_parameters(seeds: int) -> None:
     """Print scatter and reported standard deviations of a model's parameters over the design's."""
     from identification_statistics import SPECIMEN, STRAINS, TRUE, UNKNOWNS, made
 
+    from modeharvest.idic.finite_element.equations.pixels import MeshPixels
     from modeharvest.idic.finite_element.identification.identify import Readings, Unknown, identify
     from modeharvest.idic.finite_element.identification.observed import ImageData
-    from modeharvest.idic.finite_element.pixels import MeshPixels
     from modeharvest.idic.solver.noise import ImageNoise
     from modeharvest.validation.design_parameters import ModelStates
 

@@ -22,9 +22,9 @@ from scipy.sparse import csr_array
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.materials import Ogden
 from modeharvest.fem.sparse_factor import factorise
+from modeharvest.idic.finite_element.equations.system import Imbalance
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
-from modeharvest.idic.finite_element.system import Imbalance
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain
 from modeharvest.idic.photograph.plain.surface import plain_surface
 from modeharvest.imaging.grid import PixelGrid

@@ -26,6 +26,7 @@ from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of
 from modeharvest.fem.path.parametric import ParametricState, ParametricTest
 from modeharvest.fem.specimen import Imperfection
+from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.identification.ansatz_terms import Term, terms_of, with_terms
 from modeharvest.idic.finite_element.identification.identify import (
     FinerMesh,
@@ -35,7 +36,6 @@ from modeharvest.idic.finite_element.identification.identify import (
 )
 from modeharvest.idic.finite_element.identification.model_error import corrections
 from modeharvest.idic.finite_element.identification.observed import ImageData
-from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.pair import ImagePair

@@ -37,6 +37,7 @@ from modeharvest.fem.path.parametric import ParametricState, ParametricTest
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.fields import element_gradients
 from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
@@ -53,7 +54,6 @@ from modeharvest.idic.finite_element.identification.observed import (
     StateObservation,
 )
 from modeharvest.idic.finite_element.measure import measure_displacement
-from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.local.subsets import SubsetOptions, subset_field
 from modeharvest.idic.solver.noise import ImageNoise

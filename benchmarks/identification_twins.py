@@ -41,6 +41,7 @@ from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.specimen import Imperfection
+from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
@@ -54,7 +55,6 @@ from modeharvest.idic.finite_element.identification.observed import (
     at_fixed_points,
     displacement_at,
 )
-from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.imaging.distortion.lens import CameraDistortion

@@ -26,8 +26,14 @@ from whole_field import EDGE_PX
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.finite_element.measure import _STAGES, FiniteElementOptions, _Measurement
-from modeharvest.idic.finite_element.system import Body, Smoothness, SmoothnessRoots, interior_sides
+from modeharvest.idic.finite_element.correlation import COARSE
+from modeharvest.idic.finite_element.equations.system import (
+    Body,
+    Smoothness,
+    SmoothnessRoots,
+    interior_sides,
+)
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, LastStage, started
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 
@@ -107,22 +113,24 @@ def rows(
     guess = ansatz.initial_guess(pair.strain)
     start = fit_displacement(pair.truth.displacement, pair.grid, ansatz, guess, pair.mask)
     body, begin = options.body(pair.masks[0], pair.grid), time.perf_counter()
-    course = _Measurement(pair, start, body, options)
-    for stage in _STAGES:
-        course.through(stage)
+    course = LastStage(correlation := started(pair, start, body, options), options)
+    for stage in COARSE:
+        correlation.through(stage)
     course.regularise()
     taken = time.perf_counter() - begin
-    found, u, cutoff = [(0.0, numbers(course, pair, taken))], course.u.copy(), course.cutoff_px
+    found, cutoff = [(0.0, numbers(course, pair, taken))], course.cutoff_px
+    u = correlation.u.copy()
     for power in powers:
-        begin, course.u, course.kept = time.perf_counter(), u.copy(), None
-        course.prior = Weighed(body, course.start, u.reshape(-1, 2), power)
-        course._regularised(cutoff, None)
+        begin = time.perf_counter()
+        weighed = Weighed(body, correlation.start, u.reshape(-1, 2), power)
+        correlation.regularised_by(weighed, u.copy())
+        course.with_cutoff(cutoff, None)
         more = time.perf_counter() - begin
         found.append((power, numbers(course, pair, taken + more)))
     return found
 
 
-def numbers(course: _Measurement, pair: ImagePair, seconds: float) -> FloatArray:
+def numbers(course: LastStage, pair: ImagePair, seconds: float) -> FloatArray:
     """Cut-off wavelength and errors [px], coverage of 95 % intervals, seconds."""
     assert pair.truth is not None
     found, px, mask = course.result(), pair.grid.pixel_size, pair.masks[0]

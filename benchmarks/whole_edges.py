@@ -32,10 +32,11 @@ from whole_field import noisy, specimen_of
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.meshing import mesh_specimen
-from modeharvest.idic.finite_element.measure import _STAGES, FiniteElementOptions, _Measurement
+from modeharvest.idic.finite_element.correlation import COARSE, MeshCorrelation
+from modeharvest.idic.finite_element.equations.system import Body
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, LastStage, started
 from modeharvest.idic.finite_element.mesh import quadratic
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.mapping.isoparametric import locate
@@ -82,13 +83,13 @@ def causes(
     found, _ = measured(pair, start, body, options)
     fixed = replace(options, cutoff_px=found.cutoff_px)
     print(f"cut-off wavelength {found.cutoff_px:.1f} px")
-    clean, course = measured(exact, start, body, fixed)
+    clean, correlation = measured(exact, start, body, fixed)
     best = fitted(true, exact, body, found)
-    at = course.linearised()
+    at = correlation.linearised()
     weight = at.weight(found.cutoff_px * px)
     off = best.ravel() - at.prior.start  # type: ignore[union-attr]
     lost = -at.factor(weight).solve(weight * (at.R @ off)).reshape(-1, 2)
-    lost += clean.displacement - course.u.reshape(-1, 2)
+    lost += clean.displacement - correlation.u.reshape(-1, 2)
     of = {
         "all": found.displacement_on() - true,
         "mesh": found.on_pixels(best) - true,
@@ -101,13 +102,13 @@ def causes(
 
 def measured(
     pair: ImagePair, start: Result, body: Body, options: FiniteElementOptions
-) -> tuple[NodalResult, _Measurement]:
-    """The result, and the measurement at its end."""
-    course = _Measurement(pair, start, body, options)
-    for stage in _STAGES:
-        course.through(stage)
-    course.regularise()
-    return course.result(), course
+) -> tuple[NodalResult, MeshCorrelation]:
+    """The result, and the correlation at its end."""
+    last = LastStage(correlation := started(pair, start, body, options), options)
+    for stage in COARSE:
+        correlation.through(stage)
+    last.regularise()
+    return last.result(), correlation
 
 
 def fitted(true: FloatArray, pair: ImagePair, body: Body, like: NodalResult) -> FloatArray:

@@ -24,6 +24,7 @@ from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.fem.path.parametric import ParametricTest
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
@@ -33,7 +34,6 @@ from modeharvest.idic.finite_element.identification.identify import (
 )
 from modeharvest.idic.finite_element.identification.model_error import corrections
 from modeharvest.idic.finite_element.identification.observed import ImageData
-from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.imaging.imageset import make_images

@@ -10,9 +10,9 @@ from plate_with_hole import GRID, RADIUS, plate_pair
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.equations.system import NodalPattern
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
-from modeharvest.idic.finite_element.system import NodalPattern
 from modeharvest.idic.solver.free_edges import FreeEdges
 from modeharvest.imaging.pair import ImagePair
 

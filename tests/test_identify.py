@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.identification.identify import (
     LEVELS,
     FinerMesh,
@@ -33,7 +34,6 @@ from modeharvest.idic.finite_element.identification.observed import (
     through_lens,
 )
 from modeharvest.idic.finite_element.mesh import quadratic
-from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import nodal_values
 from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise

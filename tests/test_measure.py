@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from summary_schemas import faults
 from test_cli import called, error_line
 
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import (
     Given,
     field_at,
@@ -32,7 +33,6 @@ from modeharvest.idic.finite_element.files import (
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.photograph.displacement import block_motion, displacement_from, uneven_light
 from modeharvest.imaging.grid import PixelGrid

@@ -25,10 +25,10 @@ from modeharvest.fem.field import Mesh, Solution
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Imperfection, Specimen
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import quadratic
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.solver.gauss_newton import Outcome

@@ -24,9 +24,9 @@ from modeharvest.idic.finite_element.contours.measure import (
     displacement_from_contours,
 )
 from modeharvest.idic.finite_element.contours.penalised_body import PenalisedBody, straight_sides
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.plain.matching import matched_contours
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain
 from modeharvest.idic.photograph.plain.surface import away_from_cuts, plain_surface

@@ -12,15 +12,15 @@ from scipy.sparse import csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import LIBRARIES, factorise
-from modeharvest.idic.finite_element.continued import (
+from modeharvest.idic.finite_element.equations.continued import (
     NONE_CONTINUED,
     continued,
     continued_pixels,
     images_on,
 )
+from modeharvest.idic.finite_element.equations.normal_equations import normal_equations
+from modeharvest.idic.finite_element.equations.system import Body, SmoothnessRoots, interior_sides
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.normal_equations import normal_equations
-from modeharvest.idic.finite_element.system import Body, SmoothnessRoots, interior_sides
 from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair

@@ -12,8 +12,8 @@ from plate_with_hole import GRID, HALF_SIZE, plate_pair
 from modeharvest.fem.field import boundary_sides
 from modeharvest.fem.materials import JetMatrix, Ogden, TwoTermI1, stress_and_tangent
 from modeharvest.idic.finite_element.cutoff import Deviations, contradicted
+from modeharvest.idic.finite_element.equations.system import Imbalance
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
-from modeharvest.idic.finite_element.system import Imbalance
 
 MATERIALS = [Ogden(), Ogden((0.5, 0.3), (1.5, -2.0), 3.0), TwoTermI1()]
 STATES = np.array([np.eye(2), [[0.7, 0.1], [-0.2, 1.1]], 1.2 * np.eye(2), [[1.3, 0.0], [0.4, 0.8]]])

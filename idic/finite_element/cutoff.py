@@ -41,8 +41,8 @@ from typing import NamedTuple
 import numpy as np
 
 from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.equations.system import SAMPLES, SOME, Linearised, Smoothness
 from modeharvest.idic.finite_element.fields import interpolation_error, mean_around, nodal_gradient
-from modeharvest.idic.finite_element.system import SAMPLES, SOME, Linearised, Smoothness
 from modeharvest.util.arrays import FloatArray, IntArray
 
 _PROBES, _DEGREES = 4, 1.4

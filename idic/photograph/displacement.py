@@ -18,13 +18,13 @@ from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.chebyshev import Box, ChebyshevField
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
     coarse_displacement,
     measure_displacement,
 )
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import Slow, first_motion
 from modeharvest.idic.photograph.matching.blocks import (

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz, for_cells
 from modeharvest.idic.correlate import ASTRAY, correlate
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField, refitted, refitted_correlation
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion
 from modeharvest.idic.photograph.displacement import block_motion, displacement_from, misfit_of

@@ -19,9 +19,9 @@ import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates
 
 from modeharvest.idic.ansatz import FEWEST_CELLS, cells_across, for_cells
+from modeharvest.idic.finite_element.equations.system import SAMPLES, Body
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import refitted
-from modeharvest.idic.finite_element.system import SAMPLES, Body
 from modeharvest.idic.photograph.geometry import box_of
 from modeharvest.idic.photograph.plain.measure import displacement_between
 from modeharvest.idic.photograph.plain.surface import (

@@ -22,9 +22,9 @@ from modeharvest.idic.finite_element.contours.penalised_body import (
     straight_sides,
 )
 from modeharvest.idic.finite_element.cutoff import Deviations, gradient_covariance
+from modeharvest.idic.finite_element.equations.system import SAMPLES, SOME, Body
 from modeharvest.idic.finite_element.fields import interpolation_error
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.finite_element.system import SAMPLES, SOME, Body
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.contour import SeenContours
 from modeharvest.util.arrays import FloatArray

@@ -22,7 +22,7 @@ from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
 from modeharvest.idic.finite_element.contours.tied_edge import TiedEdge
-from modeharvest.idic.finite_element.system import Body, Imbalance
+from modeharvest.idic.finite_element.equations.system import Body, Imbalance
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.contour import SeenContours
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray

@@ -15,10 +15,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.continued import continued_spline, images_on
+from modeharvest.idic.finite_element.equations.continued import continued_spline, images_on
+from modeharvest.idic.finite_element.equations.normal_equations import (
+    NodalEquations,
+    normal_equations,
+)
+from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.fields import determinant, element_gradients, nodal_gradient
-from modeharvest.idic.finite_element.normal_equations import NodalEquations, normal_equations
-from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.finite_element.result import located, nodal_values
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, estimated_noise, slope_noise

@@ -10,8 +10,8 @@ import numpy as np
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.contours.measure import UNSETTLED, displacement_from_contours
+from modeharvest.idic.finite_element.equations.system import SAMPLES, Body
 from modeharvest.idic.finite_element.result import NodalResult, WholeField, refitted
-from modeharvest.idic.finite_element.system import SAMPLES, Body
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.measure import POINTS_A_CELL, MeasuredPhotograph, found_modes
 from modeharvest.idic.photograph.plain.matching import (

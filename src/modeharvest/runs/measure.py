@@ -29,6 +29,7 @@ from scipy.sparse.csgraph import connected_components
 
 from modeharvest.fem.field import Mesh, plane_mesh, read_any_mesh, read_mesh, write_mesh
 from modeharvest.idic.chebyshev import Brightness
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import (
     Given,
     read_result,
@@ -40,7 +41,6 @@ from modeharvest.idic.finite_element.files import (
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import MeshedMaterial, mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.displacement import (
     block_motion,
     brightness,

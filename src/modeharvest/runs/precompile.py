@@ -23,8 +23,8 @@ from scipy.ndimage import gaussian_filter
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import best_fit, correlate
+from modeharvest.idic.finite_element.equations.normal_equations import accumulate_elements
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
-from modeharvest.idic.finite_element.normal_equations import accumulate_elements
 from modeharvest.idic.solver.passes import accumulate
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images

@@ -16,6 +16,7 @@ from numba import get_num_threads
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.idic.correlate import ASTRAY
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import Given, read_result, write_result, write_vtu
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
 from modeharvest.idic.finite_element.result import (
@@ -24,7 +25,6 @@ from modeharvest.idic.finite_element.result import (
     refitted,
     refitted_correlation,
 )
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.imageset import ImageSet

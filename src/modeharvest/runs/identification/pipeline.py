@@ -22,6 +22,7 @@ import numpy as np
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of, parameter
+from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.fields import element_gradients
 from modeharvest.idic.finite_element.identification.ansatz_terms import terms_of, with_terms
 from modeharvest.idic.finite_element.identification.identify import (
@@ -44,7 +45,6 @@ from modeharvest.idic.finite_element.identification.observed import (
     imaged,
     rigidly_moved,
 )
-from modeharvest.idic.finite_element.pixels import MeshPixels
 from modeharvest.idic.local.field import LocalField, read_field
 from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise

@@ -27,11 +27,11 @@ import numpy as np
 
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.finite_element.continued import continued
+from modeharvest.idic.finite_element.equations.continued import continued
+from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import Given, read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField
-from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import read_field, write_field
 from modeharvest.idic.photograph.displacement import uneven_light
 from modeharvest.idic.photograph.gauges import points_of, reading_rows, write_gauges

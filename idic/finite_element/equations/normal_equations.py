@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.continued import NONE_CONTINUED, ContinuedPixels
-from modeharvest.idic.finite_element.pixels import ElementPixels
+from modeharvest.idic.finite_element.equations.continued import NONE_CONTINUED, ContinuedPixels
+from modeharvest.idic.finite_element.equations.pixels import ElementPixels
 from modeharvest.idic.solver.pyramid import LevelPair
 from modeharvest.imaging.spline import sample_points
 from modeharvest.util.arrays import FloatArray

@@ -33,9 +33,9 @@ from scipy.sparse import bsr_array, csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.idic.finite_element.equations.normal_equations import NodalEquations
+from modeharvest.idic.finite_element.equations.pixels import SLIVERS, MeshPixels
 from modeharvest.idic.finite_element.fields import mean_around
-from modeharvest.idic.finite_element.normal_equations import NodalEquations
-from modeharvest.idic.finite_element.pixels import SLIVERS, MeshPixels
 from modeharvest.idic.solver.free_edges import FreeEdges, on_sides
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled

@@ -1,0 +1,1 @@
+"""Linear systems of nodal displacements: pixels and their sums, regularisation, the factor."""

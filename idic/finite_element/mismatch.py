@@ -1,0 +1,135 @@
+"""Where the images of a correlation don't match: local minima, and surfaces that have changed.
+
+Such places are measured again from the displacement around them. Where that doesn't help, paint has
+come off, a crack has opened, or something hides the surface: those pixels don't count any more.
+What the noise of the matching pixels has in common with its neighbours is found here, too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from modeharvest.idic.finite_element.correlation import BESIDE_PX, MeshCorrelation, Stage
+from modeharvest.idic.finite_element.equations.system import Linearised
+from modeharvest.idic.solver.noise import power_of_long_waves
+from modeharvest.idic.solver.pyramid import FULL
+from modeharvest.util.arrays import BoolArray
+from modeharvest.util.masks import grown
+
+_UNLIKE = 0.25
+"""Images don't match in an element whose mean square residual less noise, over the reference's
+variance, is larger."""
+_SEEN = 0.25
+"""Least share of an element's pixels that are on the deformed image's material."""
+_BY_CHANCE = 5.0
+"""Largest departure of a mean square of noise from its variance [standard deviations]."""
+_SOME_PIXELS = 200
+"""So many pixels in all may not match: elements of an edge that show some background."""
+_AROUND = 2
+"""Layers of elements around such elements that count, too, as few speckles also match elsewhere."""
+_DIFFERS, _MOST_HIDDEN = 0.5, 0.8
+"""Pixels differ if their residual, beyond noise, is larger than this, over the speckle's standard
+deviation; they count nevertheless if they are a larger share of the material."""
+_SAMPLED = 200_000
+"""Pixels from which the correlation of noise is estimated."""
+_BLANK = 0.01
+"""Share of the material without speckle above which a warning is given [-]."""
+_GUESS = (
+    "there the displacement is the smoothest that fits around, and its standard deviation a guess."
+)
+
+
+def unlike(correlation: MeshCorrelation, at: Linearised | None = None) -> BoolArray:
+    """(m,) True for elements in which the unfiltered images don't match."""
+    grey, sums = correlation.on(FULL).pixels.grey, (at or correlation.linearised()).sums
+    chance = sums.weights + _BY_CHANCE * np.sqrt(2.0 * sums.weights)
+    expected = _UNLIKE * float(grey.var()) * sums.weights + sum(correlation.noise) * chance
+    return np.asarray(sums.squares > expected)
+
+
+def again_where_unlike(correlation: MeshCorrelation, *stages: Stage) -> None:
+    """Measure again from the displacement around where images don't match, while that helps.
+
+    Where it doesn't, pixels don't count.
+    """
+    body, pixels = correlation.body, np.diff(correlation.on(FULL).pixels.start)
+    while pixels[off := unlike(correlation)].sum() > _SOME_PIXELS:
+        u, prior, known = correlation.u, correlation.prior, body.away_from(off, _AROUND)
+        smooth = correlation.from_around(correlation.start, known)
+        start = np.where(known[:, None], correlation.start, smooth)
+        correlation.restart(start, known)
+        for stage in stages:
+            correlation.through(stage)
+        if unlike(correlation).sum() >= off.sum():
+            correlation.regularised_by(prior, u)
+            _hide(correlation, np.asarray(~known[body.mesh.cells].any(axis=1)), *stages)
+            break
+        correlation.start = start
+
+
+def _hide(correlation: MeshCorrelation, cells: BoolArray, *stages: Stage) -> None:
+    """Measure without the pixels of elements (m,), then with those of them that match."""
+    on, full = correlation.on(FULL), [stage for stage in stages if stage.level == FULL]
+    around, before = on.pixels.only(np.repeat(cells, np.diff(on.pixels.start))), correlation.hidden
+    if around.row.size > _MOST_HIDDEN * on.pixels.row.size:
+        return
+    differ: BoolArray = np.ones(around.row.size, np.bool_)
+    limit = _DIFFERS * float(on.pixels.grey.std()) + _BY_CHANCE * np.sqrt(sum(correlation.noise))
+    for then in (stages, full, full):  # blurred images mix them with what is around
+        hidden = np.zeros_like(before)
+        hidden[around.row[differ], around.col[differ]] = True
+        correlation.without(before | grown(hidden, BESIDE_PX))
+        known = correlation.body.away_from(np.diff(correlation.on(FULL).pixels.start) == 0)
+        correlation.start = correlation.from_around(correlation.u.reshape(-1, 2), known)
+        correlation.restart(correlation.start, known)
+        for stage in then:
+            correlation.through(stage)
+        residual = correlation.residual(around)[around.row, around.col]
+        differ = around.with_rest_of_elements(~(np.abs(residual) <= limit))
+
+
+def noise_power(correlation: MeshCorrelation) -> float:
+    """Power of the noise at long waves over its variance, from middle rows of the residual."""
+    pixels = correlation.on(FULL).pixels
+    share = min(1.0, _SAMPLED / pixels.row.size)
+    low, high = np.quantile(pixels.row, [0.5 - 0.5 * share, 0.5 + 0.5 * share])
+    alike = np.repeat(~unlike(correlation), np.diff(pixels.start))
+    some = pixels.only((pixels.row >= low) & (pixels.row <= high) & alike)
+    residual = correlation.residual(some)
+    contrast = float(some.grey.std()) if some.grey.size else 0.0
+    return power_of_long_waves(np.nan_to_num(residual), np.isfinite(residual), contrast)
+
+
+def matched(correlation: MeshCorrelation) -> BoolArray:
+    """(n,) True at nodes where the unfiltered images match, and both show the material."""
+    body, pixels = correlation.body, np.diff(correlation.on(FULL).pixels.start)
+    at = correlation.linearised()
+    is_off, is_seen = unlike(correlation, at), at.sums.counts >= _SEEN * pixels
+    return np.asarray(body.away_from(is_off, _AROUND) & body.away_from(~is_seen))
+
+
+def mismatches(correlation: MeshCorrelation, at: Linearised) -> tuple[str, ...]:
+    """Warnings of places without speckle, of changed surfaces, and of images that don't match."""
+    found, counts = [], np.diff(correlation.on(FULL).pixels.start)
+    total = counts.sum() + correlation.hidden.sum()
+    blank = float((counts[at.signal == 0.0].sum() + correlation.blank.sum()) / total)
+    if blank > _BLANK:
+        found.append(
+            f"{100 * blank:.0f} % of the material shows no speckle that is in both images: {_GUESS}"
+        )
+    if (changed := correlation.hidden & ~correlation.blank).any():
+        (row, col), share = np.argwhere(changed).mean(axis=0), 100.0 * changed.sum() / total
+        found.append(
+            f"Around row {row:.0f}, column {col:.0f} the surface has changed, or is hidden (on "
+            f"{share:.2g} % of the material): {_GUESS}"
+        )
+    if counts[off := unlike(correlation, at)].sum() > _SOME_PIXELS:
+        mesh, grid = correlation.body.mesh, correlation.pair.grid
+        worst = np.argmax(at.sums.squares / np.maximum(at.sums.weights, 1.0))
+        row, col = grid.to_px(*mesh.nodes[mesh.cells[worst]].mean(axis=0))
+        found.append(
+            f"Around row {row:.0f}, column {col:.0f} the images don't match (on "
+            f"{100 * counts[off].sum() / counts.sum():.2g} % of the material): there the "
+            "surface has changed, or the displacement is wrong."
+        )
+    return tuple(found)
