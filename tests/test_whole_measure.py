@@ -343,6 +343,19 @@ def test_a_reflection_spoils_nothing_around(grey: float) -> None:
     assert np.abs(error).max() < 0.2
 
 
+def test_the_largest_of_two_changed_places_is_named() -> None:
+    """Their mean position was named, between the two."""
+    pair, at = plate_pair(wavy_field), np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
+    near = (np.abs(at - [0.8, -0.4]) < 0.2).all(axis=-1)
+    near |= (np.abs(at - [-0.7, 0.3]) < 0.12).all(axis=-1)
+    glare = 0.9 + 0.05 * np.random.default_rng(0).standard_normal(near.shape)
+    shown = pair.with_images(pair.reference, np.where(near, glare, pair.deformed))
+    *_, warning = measure_displacement(shown, at_rest, options=COARSE).warnings
+    row, col = map(int, re.findall(r"row (\d+), column (\d+)", warning)[0])
+    assert np.linalg.norm(at[row, col] - [0.8, -0.4]) < 0.1
+    assert "smaller place" in warning
+
+
 @pytest.mark.parametrize("shift", [(2, 0), (4, 4), (-3, 2), (0, -6)])
 def test_a_surface_that_fills_the_picture_and_moves(shift: tuple[int, int]) -> None:
     """In a corner that left the picture, blurs pulled the displacement off by 10 to 24 px."""

@@ -8,6 +8,7 @@ What the noise of the matching pixels has in common with its neighbours is found
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import label
 
 from modeharvest.idic.finite_element.correlation import BESIDE_PX, MeshCorrelation, Stage
 from modeharvest.idic.finite_element.equations.system import Linearised
@@ -85,7 +86,7 @@ def _hide(correlation: MeshCorrelation, cells: BoolArray, *stages: Stage) -> Non
         for stage in then:
             correlation.through(stage)
         residual = correlation.residual(around)[around.row, around.col]
-        differ = around.with_rest_of_elements(~(np.abs(residual) <= limit))
+        differ = around.completed(~(np.abs(residual) <= limit))
 
 
 def noise_power(correlation: MeshCorrelation) -> float:
@@ -118,10 +119,13 @@ def mismatches(correlation: MeshCorrelation, at: Linearised) -> tuple[str, ...]:
             f"{100 * blank:.0f} % of the material shows no speckle that is in both images: {_GUESS}"
         )
     if (changed := correlation.hidden & ~correlation.blank).any():
-        (row, col), share = np.argwhere(changed).mean(axis=0), 100.0 * changed.sum() / total
+        places, count = label(changed)
+        largest = np.argwhere(places == 1 + np.bincount(places.ravel())[1:].argmax())
+        (row, col), share = largest.mean(axis=0), 100.0 * changed.sum() / total
+        others = f" and in {count - 1} smaller place{'s' * (count > 2)}" if count > 1 else ""
         found.append(
-            f"Around row {row:.0f}, column {col:.0f} the surface has changed, or is hidden (on "
-            f"{share:.2g} % of the material): {_GUESS}"
+            f"Around row {row:.0f}, column {col:.0f}{others} the surface has changed, or is hidden "
+            f"(on {share:.2g} % of the material): {_GUESS}"
         )
     if counts[off := unlike(correlation, at)].sum() > _SOME_PIXELS:
         mesh, grid = correlation.body.mesh, correlation.pair.grid

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,10 +58,10 @@ _DENSER = 5, 16
 """
 _SMOOTH_PX = 60.0
 """Shorter waves of an initial guess come from motions in whole pixels, and would remain."""
-_SMOOTHER_FROM, _SMOOTHED_OVER, _LESS_SMOOTH = 0.75, 4.0, 2.0
+_SMOOTHER_FROM, _OVER_CUTOFFS = 0.75, (4.0, 2.0)
 """Ratio of cut-off to shortest wave of the initial guess from which on a smoother one is tried, and
-over how many cut-offs that one is smoothed; over how many if the images then require a shorter
-cut-off (over one, errors of smooth waves are 1.4 times their standard deviation)."""
+over how many cut-offs it is smoothed: over fewer if the images then require a shorter cut-off (over
+one, errors of smooth waves are 1.4 times their standard deviation)."""
 _LOST = 0.1
 """Share of nodes at which images don't match from which on even light is tried, too."""
 _STRAY, _NEIGHBOURS = 8.0, 8
@@ -85,6 +86,17 @@ _SAMPLES, _LEAST = 100_000, 0.1
 """Pixels from which brightness is fitted; least gain anywhere, over the mean."""
 
 
+class _Swept(NamedTuple):
+    """Displacement after the first measurements."""
+
+    unknown: int
+    """Nodes at which the images don't match."""
+    start: FloatArray
+    """(n, 2) start of the last measurement, smooth and from around where they don't match [mm]."""
+    u: FloatArray
+    """(n, 2) displacement of the nodes [mm]."""
+
+
 def displacement_from(
     start: FloatArray, pair: ImagePair, body: Body, options: FiniteElementOptions = _LAST,
     progress: Progress = silent, light_degree: int = 0,
@@ -104,8 +116,8 @@ def displacement_from(
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(pair_alike, deformed_mask=mask)
 
-    def swept(degree: int) -> tuple[int, FloatArray, FloatArray]:
-        """Nodes at which the images don't match, a better start, and u."""
+    def swept(degree: int) -> _Swept:
+        """Repeat the first measurement until the images match everywhere, or no better."""
         better, u, unknown = start, start, 0 if pair.deformed_mask is not None else len(start)
         for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
             u, known = coarse_displacement(seen(u, off_px, degree), better, body, options=_FIRST)
@@ -114,12 +126,12 @@ def displacement_from(
             before, unknown = unknown, int((~known).sum())
             if sweep and not 0 < unknown < before:
                 break
-        return unknown, better, u
+        return _Swept(unknown, better, u)
 
-    found_start = swept(light_degree)
-    if light_degree and found_start[0] > _LOST * len(start):  # slopes adapt to a start far off
-        found_start = min(found_start, swept(0), key=lambda each: each[0])
-    _, start, u = found_start
+    first = swept(light_degree)
+    if light_degree and first.unknown > _LOST * len(start):  # slopes adapt to a start far off
+        first = min(first, swept(0), key=lambda each: each.unknown)
+    _, start, u = first
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
     pair_alike = seen(u, _AT_EDGE_PX, light_degree)
     found = measured(pair_alike, start)
@@ -127,10 +139,11 @@ def displacement_from(
         return found
     # Shorter waves of the start are noise of the same images, which no error estimate would count.
     wave = found.cutoff_px * pair.grid.pixel_size
-    smoother = measured(pair_alike, body.smoothed(start, _SMOOTHED_OVER * wave))
-    if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
-        return smoother
-    return measured(pair_alike, body.smoothed(start, _LESS_SMOOTH * wave))
+    for over in _OVER_CUTOFFS:
+        smoother = measured(pair_alike, body.smoothed(start, over * wave))
+        if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
+            break
+    return smoother
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:

@@ -29,7 +29,7 @@ _MIXED_PX = 2
 _SIGMA_PX = 1.5
 """Standard deviation of the Gaussian weights of the material's pixels for that."""
 _WINDOW_PX = 6
-_BLURS, _MOST = 2.0, 1 / 16
+_BLURS, _WIDEST = 2.0, 1 / 16
 """Width of the strip along the image's border where a blur depends on what is beyond [blurs]; at
 most this share of the shorter side."""
 _RIDGE = 1e-3
@@ -51,7 +51,7 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
         pure = pair if pair.mask is None else replace(pair, mask=eroded(pair.mask, margin))
         covered = binned(pair.reference, inside, level.factor)[1] >= 0.5
         within = np.zeros(covered.shape, np.bool_)
-        width = round(min(_BLURS * level.blur, _MOST * min(within.shape)))
+        width = round(min(_BLURS * level.blur, _WIDEST * min(within.shape)))
         within[width : within.shape[0] - width, width : within.shape[1] - width] = True
         coarse = level_pair(pure, level, edge_px, order)
         return replace(coarse, mask=covered & within, valid=within)

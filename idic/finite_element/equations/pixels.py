@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
@@ -47,8 +46,8 @@ class ElementPixels(NamedTuple):
         start = np.concatenate([[0], np.cumsum(keep)])[self.start]
         return ElementPixels(start, *(p[..., keep] if p.shape[-1] else p for p in self[1:]))
 
-    def with_rest_of_elements(self, chosen: BoolArray) -> BoolArray:
-        """(p,) the chosen pixels (p,), with all others of elements of which most are chosen."""
+    def completed(self, chosen: BoolArray) -> BoolArray:
+        """(p,) the chosen pixels (p,), and all of the elements of which most are chosen."""
         count = np.diff(self.start)
         many = np.diff(np.concatenate([[0], np.cumsum(chosen)])[self.start]) > 0.5 * count
         return chosen | np.repeat(many, count)
@@ -92,10 +91,14 @@ def flat(image: FloatImage, mask: BoolArray, speckle_px: float) -> BoolArray:
     Such are reflections of lamps, which don't move with the material. None are found where much of
     the pattern has few grey levels, as black and white ones have.
     """
-    low, high = minimum_filter(image, 3), maximum_filter(image, 3)
-    same = mask & (high - low <= _FLAT * float(image[mask].std() if mask.any() else 0.0))
-    is_pattern = same.sum() > _MOST_FLAT * mask.sum()
-    return large_parts(same & (not is_pattern), _SPECKLES * speckle_px**2)
+    same, least = mask.copy(), _SPECKLES * speckle_px**2
+    largest = _FLAT * float(image[mask].std() if mask.any() else 0.0)
+    for of, step in ((same, np.diff(image, axis=0)), (same.T, np.diff(image, axis=1).T)):
+        alike = np.abs(step) <= largest
+        of[1:] &= alike
+        of[:-1] &= alike
+    is_some = least <= same.sum() <= _MOST_FLAT * mask.sum()
+    return large_parts(same, least) if is_some else np.zeros_like(mask)
 
 
 def _require_cover(covered: BoolArray, mask: BoolArray, beyond: float) -> None:

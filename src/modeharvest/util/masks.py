@@ -11,6 +11,7 @@ from modeharvest.util.arrays import BoolArray, IntArray
 def grown(mask: BoolArray, px: float) -> BoolArray:
     """Dilation: all pixels within the distance ``px`` of the mask; an empty mask stays empty."""
     found, wide, half = mask.copy(), mask.copy(), 0
+    px = px if mask.any() else 0.0
     for off in range(min(int(px), len(mask) - 1), -1, -1):  # rows of a disk, the outermost first
         while np.sqrt((half + 1) ** 2 + off**2) <= px:
             half += 1
