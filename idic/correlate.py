@@ -76,7 +76,7 @@ def correlate(
     guess : (size,) initial unknowns, instead of a strain.
     options, progress : How to correlate; progress listener.
     """
-    options = options or CorrelationOptions()
+    options, pair = options or CorrelationOptions(), pair.without_extremes()
     course, levels = _Course(options, progress), options.levels
     a = _with_gain_and_offset(ansatz, _initial_guess(pair, ansatz, strain, guess), pair)
     smoothing: FinalSmoothing | None = None

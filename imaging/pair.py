@@ -43,6 +43,9 @@ _PARTS = {
 _TYPES = {"element": np.int32, "deformed_displacement": np.float32, "residual_px": np.float32}
 """Types of the arrays that aren't float64."""
 _CHUNK_ROWS = 64
+_FEW, _EVERY = 0.02, 7
+"""Share of the material, at each end, whose grey levels may be far beyond those of the rest; every
+how many pixels quantiles are taken."""
 
 
 class HasDisplacement(Protocol):
@@ -169,6 +172,21 @@ class ImagePair:
     def with_images(self, reference: NDArray[Any], deformed: NDArray[Any]) -> Self:
         """The same pair with other grey levels, for example noisy or blurred ones."""
         return replace(self, reference=reference, deformed=deformed)
+
+    def without_extremes(self) -> Self:
+        """The same pair, with grey levels far beyond those of nearly all material at the median.
+
+        Blurs would spread reflections and defective pixels of images of many bits. Levels that the
+        reference's material has are never extreme: the deformed one may be elsewhere.
+        """
+        images, least, most = [], np.inf, -np.inf
+        for image in (self.reference, self.deformed):
+            grey = image[self.masks[0]][::_EVERY]
+            low, high = np.quantile(grey, [_FEW, 1.0 - _FEW])
+            least, most = min(least, 2.0 * low - high), max(most, 2.0 * high - low)
+            extreme = (image < least) | (image > most)
+            images.append(np.where(extreme, np.median(grey), image) if extreme.any() else image)
+        return self.with_images(*images)
 
     def rms(self, measured: HasDisplacement) -> float:
         """Rms *per component* of truth - measured on material [mm]; InputError without a truth."""

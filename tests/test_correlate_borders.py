@@ -148,3 +148,21 @@ def moved_holes() -> BoolArray:
 
 def _solid(x: FloatArray, y: FloatArray) -> BoolArray:
     return np.asarray(np.hypot(x % 0.7 - 0.35, y % 0.7 - 0.35) > 0.2)
+
+
+@pytest.mark.parametrize("in_reference", [False, True])
+def test_a_reflection_brighter_than_the_speckle_counts_no_more_than_a_grey_one(
+    in_reference: bool,
+) -> None:
+    """Of 16-bit images: it is as bright as 10 standard deviations, on 1.3 % of the material."""
+    f, g = (image.copy() for image in images(0))
+    inner = landing() > 10
+    errors = []
+    for level in (0.0, 10.0):
+        shown = [f.copy(), g.copy()]
+        image = shown[0] if in_reference else shown[1]
+        image[60:77, 50:66] = image.mean() + level * image.std()
+        pair = ImagePair(*shown, GRID, inner)
+        found = correlate(pair, ANSATZ, guess=ANSATZ.initial_guess(STRAIN))
+        errors.append(error_px(found.displacement(), inner))
+    assert errors[1] < 1.25 * errors[0] < 0.1  # 16 px if its level counted

@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 171, 35_299
+MOST_MODULES, MOST_LINES = 171, 35_317
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -84,7 +84,7 @@ OWN_BOUNDS = {
     FIRST_TOUCH: (3, 350),
     CONTOURS: (17, 4_378), SEQUENCES: (12, 2_918), EXPLORE: (2, 306), SHARED_DATA: (3, 468),
     GAUGES_AND_FORMATS: (9, 1_762),
-    WHOLE_DISPLACEMENT: (12, 2_532),
+    WHOLE_DISPLACEMENT: (12, 2_533),
 }  # fmt: skip
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 

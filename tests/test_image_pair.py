@@ -81,3 +81,29 @@ def test_rms_is_per_component_and_of_the_material_alone() -> None:
     assert pair.rms(Shift([0.0, 0.3])) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 2))
     with pytest.raises(InputError, match="displacement is known"):
         ImagePair(F, F[::-1], GRID).rms(Shift([0.0, 0.0]))
+
+
+def test_grey_levels_far_beyond_the_material_s_are_replaced_by_its_median() -> None:
+    grid = PixelGrid.centred(200, 200, 0.1)
+    f, g = np.random.default_rng(1).standard_normal((2, *grid.shape)).astype(np.float32)
+    pair = ImagePair(f, g, grid)
+    same = pair.without_extremes()
+    np.testing.assert_array_equal([same.reference, same.deformed], [f, g])
+    glare, defect = g.copy(), f.copy()
+    glare[40:65, 100:125], defect[7, 9] = 20.0, -1e6  # 1.6 % of the image, and one pixel
+    shown = pair.with_images(defect, glare).without_extremes()
+    changed = np.stack([shown.reference != defect, shown.deformed != glare])
+    assert changed[0].sum() == 1
+    assert changed[1].sum() == 25 * 25
+    np.testing.assert_allclose(shown.deformed[40:65, 100:125], np.median(g), atol=0.05)
+    brighter = pair.with_images(300.0 * defect + 1e3, 300.0 * glare + 1e3).without_extremes()
+    np.testing.assert_allclose(brighter.deformed, 300.0 * shown.deformed + 1e3, rtol=1e-5)
+
+
+def test_material_that_has_moved_away_is_not_extreme() -> None:
+    """Where it was, the deformed image shows nothing but the background, of one grey level."""
+    grid = PixelGrid.centred(100, 200, 0.1)
+    f, g = np.zeros((2, *grid.shape), np.float32)
+    f[:, 20:60] = g[:, 80:120] = 5.0 + np.random.default_rng(0).standard_normal((100, 40))
+    found = ImagePair(f, g, grid, mask=f > 0.0).without_extremes()
+    np.testing.assert_array_equal(found.deformed, g)

@@ -89,6 +89,7 @@ class MeshCorrelation:
         number of steps in a stage.
         """
         pair = pair if body.mask is None else replace(pair, mask=pair.masks[0] & body.mask)
+        pair = pair.without_extremes()
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = spline_order(self.speckle_px)
         blank, hidden = (
