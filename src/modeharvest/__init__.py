@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from modeharvest.util import __version__
-
 TYPE_CHECKING = False  # typing's own takes longer to import than everything here
 if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from typing import Any
@@ -36,6 +34,8 @@ if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from modeharvest.runs.case import shipped_solution
     from modeharvest.runs.photographs.pipeline import harvest
 
+    __version__: str
+
 __all__ = [
     "Ansatz", "Experiment", "ImagePair", "ImagingSpec", "Ogden", "Result", "Solution", "Specimen",
     "__version__", "best_fit", "correlate", "harvest", "make_images", "run", "score",
@@ -43,6 +43,7 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
+    "__version__": "util",
     "Ansatz": "idic.ansatz", "Experiment": "fem.experiment", "ImagePair": "imaging.pair",
     "ImagingSpec": "imaging.spec", "Ogden": "fem.materials", "Result": "idic.result",
     "Solution": "fem.field", "Specimen": "fem.specimen", "best_fit": "idic.correlate",
