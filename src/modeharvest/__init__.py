@@ -43,7 +43,6 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "__version__": "util",
     "Ansatz": "idic.ansatz", "Experiment": "fem.experiment", "ImagePair": "imaging.pair",
     "ImagingSpec": "imaging.spec", "Ogden": "fem.materials", "Result": "idic.result",
     "Solution": "fem.field", "Specimen": "fem.specimen", "best_fit": "idic.correlate",
@@ -55,6 +54,10 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Load a public name from its module when it is first used."""
+    if name == "__version__":  # git may have to be asked
+        from modeharvest.util import version
+
+        return version()
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
