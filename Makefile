@@ -12,7 +12,7 @@ LOOSE := $(addprefix --disable-error-code=,arg-type assignment misc no-any-retur
   operator return-value type-arg union-attr unused-ignore var-annotated)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lattices test lint test-next bench shipped clean
+.PHONY: help demo docs dist lattices test lint test-next bench shipped clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | \
@@ -23,6 +23,13 @@ demo: ## Reproduce the paper's virtual experiment in out/demo (open report.html)
 
 docs: ## Build the documentation in docs/_build/html (a minute; the gallery's examples are run)
 	$(ENV) python -m sphinx -b html -W --keep-going -j 2 docs docs/_build/html
+
+dist: docs ## Make what a release consists of in dist: wheel, source archive, documentation
+	rm -rf dist build src/*.egg-info
+	$(ENV) python -m build --no-isolation --outdir dist .
+	rm -rf build src/*.egg-info
+	name=modeharvest-$$($(ENV) modeharvest --version)-docs && \
+	  tar -C docs/_build -czf dist/$$name.tar.gz --transform "s/^html/$$name/" html
 
 lattices: ## Analyse the infinite lattices that are shipped in out/lattices (minutes)
 	for case in square-lattice hexagonal-lattice chiral-lattice mode-study; do \

@@ -11,11 +11,11 @@ gc.set_threshold(50_000, 20, 20)  # a tenth of the time: most of what pages are 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
 
-from modeharvest.util import __version__  # noqa: E402
+from modeharvest.util import version as own_version  # noqa: E402
 
 project = "modeharvest"
 author = "the authors of modeharvest"
-release = version = __version__
+release = version = own_version()
 copyright = "2026, the authors of modeharvest. MIT licence"
 language = "en"
 

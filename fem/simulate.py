@@ -25,7 +25,7 @@ from modeharvest.fem.path.bifurcation import (
 from modeharvest.fem.path.continuation import PathFollower, State
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.stability import Mode
-from modeharvest.util import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.progress import Progress, silent
 
@@ -175,7 +175,7 @@ class _Run:
         self, path: list[State], critical: Critical | None, branches: dict[str, list[State]]
     ) -> dict[str, Any]:
         paths = {"primary": path, **branches}
-        versions = {"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION}
+        versions = {"modeharvest": RELEASE, "dolfinx": dolfinx_api.VERSION}
         versions |= {"numpy": np.__version__, "python": platform.python_version()}
         return {
             **self.experiment.described(),
@@ -300,7 +300,7 @@ def simulate_pattern(
             "loading": {"edges": experiment.edges, "length_mm": spec.length},
             "mesh_size_mm": experiment.mesh_size,
             "factorisations": structure.factorisations,
-            "versions": {"modeharvest": __version__},
+            "versions": {"modeharvest": RELEASE},
             "critical": info,
             "outcome": outcome,
         },

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from distributed import default_client
 
-from modeharvest import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_json
 from modeharvest.util.stages import source_digest
@@ -119,8 +119,8 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
             ("0.0.1", source_digest(), True),
             r"expected modeharvest .*, got 0\.0\.1 .*on the one at tcp",
         ),
-        ((__version__, "0" * 64, True), r"expected modeharvest .*, got .* with 0{12} on the one"),
-        ((__version__, source_digest(), False), "expected workers that can write to the folder"),
+        ((RELEASE, "0" * 64, True), r"expected modeharvest .*, got .* with 0{12} on the one"),
+        ((RELEASE, source_digest(), False), "expected workers that can write to the folder"),
     ):
         monkeypatch.setattr(workers, "handshake", lambda function, mark, answer=answer: answer)
         with pytest.raises(InputError, match=message):

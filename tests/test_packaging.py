@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import site
 import subprocess
@@ -13,6 +14,8 @@ from pathlib import Path
 import pytest
 
 import modeharvest
+from modeharvest import util
+from modeharvest.util import RELEASE
 
 PROJECT = Path(__file__).resolve().parent.parent
 SOURCE = PROJECT / "src" / "modeharvest"
@@ -136,16 +139,67 @@ def test_all_but_fem_imports_elsewhere_without_dolfinx(
 
 
 def test_the_installed_version_is_the_package_s(installed: Path, tmp_path: Path) -> None:
-    script = "from importlib.metadata import version; print(version('modeharvest'))"
-    assert run(installed, "-c", script, cwd=tmp_path).strip() == modeharvest.__version__
+    script = "from importlib.metadata import version; import modeharvest as m; "
+    script += "print(version('modeharvest'), m.__version__)"
+    assert run(installed, "-c", script, cwd=tmp_path).split() == [RELEASE, RELEASE]
 
 
 def test_the_installed_command_says_its_version(installed: Path, tmp_path: Path) -> None:
     command = installed.with_name("modeharvest")
-    assert modeharvest.__version__ in run(command, "--version", cwd=tmp_path)
+    assert run(command, "--version", cwd=tmp_path).strip() == RELEASE
 
 
-def test_versions_agree() -> None:
-    version = modeharvest.__version__
+@pytest.mark.parametrize(
+    ("described", "version"),
+    [
+        ("v1.2.0\n", "1.2.0"),
+        ("v1.2.0-5-g1a2b3c4", "1.2.0.post5+g1a2b3c4"),
+        ("v1.2.0-5-g1a2b3c4-dirty", "1.2.0.post5+g1a2b3c4.dirty"),
+        ("v1.2.0rc1-dirty", "1.2.0rc1+dirty"),
+        ("1a2b3c4d", f"{RELEASE}+g1a2b3c4d"),  # no tag, as in a shallow clone
+        ("", RELEASE),  # no git
+        ("$Format:%(describe)$", RELEASE),  # an archive that git didn't make
+    ],
+)
+def test_the_version_follows_from_the_tag(
+    described: str, version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The folder of a checkout, and what scripts/env has found there.
+    monkeypatch.setenv("MODEHARVEST_DESCRIBED", f"{PROJECT} {described}")
+    assert util._from_description(util._described(PROJECT)) == version
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_versions_of_clones_and_archives(tmp_path: Path) -> None:
+    def version(folder: Path) -> str:
+        script = "import modeharvest as m; print(m.__version__)"
+        path = f"import sys; sys.path.insert(0, {str(folder / 'src')!r}); {script}"
+        return run(sys.executable, "-c", path, cwd=tmp_path).strip()
+
+    clone = tmp_path / "clone"
+    git = ("git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", clone)
+    run("git", "init", "--quiet", clone, cwd=tmp_path)
+    for name in ("src/modeharvest/__init__.py", "src/modeharvest/util/__init__.py",
+                 ".gitattributes", ".git_archival.txt"):  # fmt: skip
+        (clone / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(PROJECT / name, clone / name)
+    run(*git, "add", ".", cwd=tmp_path)
+    run(*git, "commit", "--quiet", "-m", "first", cwd=tmp_path)
+    assert version(clone).startswith(f"{RELEASE}+g")
+    run(*git, "tag", "v7.1.0", cwd=tmp_path)
+    assert version(clone) == "7.1.0"
+    run(*git, "commit", "--quiet", "--allow-empty", "-m", "second", cwd=tmp_path)
+    assert version(clone).startswith("7.1.0.post1+g")
+    archive = tmp_path / "archive"
+    run(*git, "archive", "--output", tmp_path / "a.tar", "v7.1.0", cwd=tmp_path)
+    shutil.unpack_archive(tmp_path / "a.tar", archive, filter="data")
+    assert version(archive) == "7.1.0"
+
+
+def test_what_is_recorded_of_the_release_agrees() -> None:
     citation = (PROJECT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
-    assert f"version: {version}" in citation
+    assert f"version: {RELEASE}" in citation
+    changes = (PROJECT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## \[(.+?)\]", changes, re.MULTILINE)[:2] == ["Unreleased", RELEASE]
+    tagged = re.match(r"\d+(\.\d+)*$", modeharvest.__version__)
+    assert not tagged or modeharvest.__version__ == RELEASE, "set RELEASE before the tag"

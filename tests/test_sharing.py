@@ -9,6 +9,7 @@ ranked by what they hand in, and what can't be graded is named.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -234,20 +235,26 @@ def test_codes_are_ranked_over_the_cases(benchmark: tuple[Path, Path], tmp_path:
     (codes / "half" / "second.csv").write_text("nothing\n")
     (codes / "half" / "secnd.csv").write_text("nothing\n")
     (codes / "half" / "README.txt").write_text("no field\n")
+    (codes / "broken").mkdir()
+    (codes / "broken" / "first.csv").write_text("nothing\n")
     board = leaderboard(codes, truth, tmp_path / "out")
-    assert [row["code"] for row in board["codes"]] == ["fine", "coarse", "half"]
-    assert [row["counted"] for row in board["codes"]] == [2, 2, 1]
+    assert [row["code"] for row in board["codes"]] == ["fine", "coarse", "half", "broken"]
+    assert [row["counted"] for row in board["codes"]] == [2, 2, 1, 0]
+    assert board["codes"][-1]["rms_px"] is None
     assert board["codes"][0]["rms_px"] == pytest.approx(0.04, rel=0.1)  # the root of 0.02 * 0.08
-    assert list(board["refused"]) == [str(codes / "half" / f"{n}.csv") for n in ("secnd", "second")]
+    refused = [("half", "secnd"), ("broken", "first"), ("half", "second")]
+    assert list(board["refused"]) == [str(codes / code / f"{n}.csv") for code, n in refused]
     assert "one of the cases first, second" in board["refused"][str(codes / "half" / "secnd.csv")]
     command = ("benchmark", "leaderboard", codes, "--truth", truth, "--out", tmp_path / "again")
     done = CliRunner().invoke(app, list(map(str, command)))
     assert done.exit_code == 2
-    assert done.output.count("error: ") == 2
+    assert done.output.count("error: ") == 3
+    assert "   broken: no case that counts" in done.output
     text = (tmp_path / "out" / "report.html").read_text("utf-8")
     page = Page(text)
     assert {"first/report.html", "second/report.html"} <= set(page.links)
     assert "T &lt;1&gt;" in text
+    assert re.search(r"<th[^>]*>broken</th>", text)
     assert (tmp_path / "out" / "first" / "report.html").is_file()
 
 

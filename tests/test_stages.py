@@ -23,7 +23,7 @@ import synthetic_benchmark
 import modeharvest
 from modeharvest.cli.root import main
 from modeharvest.util import stages
-from modeharvest.util.errors import InputError, WriteError
+from modeharvest.util.errors import InputError, MissingDependencyError, WriteError
 from modeharvest.util.stages import (
     StagedRun,
     Stages,
@@ -229,7 +229,7 @@ def test_a_fixed_folder_is_refused_with_its_holder_and_free_afterwards(tmp_path:
             pass
     with exclusive(tmp_path):
         assert (tmp_path / ".lock").exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["sub"]
+    assert not list(tmp_path.iterdir())  # "sub" was made for its lock alone
 
 
 def test_the_system_gives_the_folder_back_when_its_holder_is_killed(tmp_path: Path) -> None:
@@ -365,7 +365,7 @@ def test_every_command_that_writes_a_folder_has_it_alone(
 def test_under_mpirun_one_rank_holds_for_all_and_all_are_refused(tmp_path: Path) -> None:
     program = (
         "import sys\n"
-        "from modeharvest.util.errors import InputError\n"
+        "from modeharvest.util.errors import InputError, MissingDependencyError\n"
         "from modeharvest.util.stages import exclusive\n"
         "try:\n"
         f"    with exclusive({str(tmp_path)!r}):\n"
@@ -389,3 +389,17 @@ def test_under_mpirun_one_rank_holds_for_all_and_all_are_refused(tmp_path: Path)
 def test_a_command_can_be_typed_again_whatever_its_files_are_called() -> None:
     line = command_line("harvest", Path("my test.toml"), "--out", "out/a b")
     assert line == "modeharvest harvest 'my test.toml' --out 'out/a b'"
+
+
+def test_a_stage_that_fails_at_once_leaves_no_folder(tmp_path: Path) -> None:
+    def work() -> list[Path]:
+        raise MissingDependencyError("no dolfinx")
+
+    stages = Stages(tmp_path / "out" / "run")
+    with pytest.raises(MissingDependencyError):
+        stages.do("fem", "key", work)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "out").mkdir()  # what was there before stays
+    with pytest.raises(MissingDependencyError):
+        stages.do("fem", "key", work)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "out"]

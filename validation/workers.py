@@ -25,7 +25,7 @@ from typing import Any
 
 import numba
 
-from modeharvest.util import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, write_json
 from modeharvest.util.stages import digest, source_digest, stage_key
@@ -91,7 +91,7 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
 
 def store(path: Path, case: Case, result: Mapping[str, Any] | None, error: str) -> None:
     """Write the result of a case, or the traceback of its failure."""
-    content = {"version": __version__, "case": dict(case), "error": error, "result": result}
+    content = {"version": RELEASE, "case": dict(case), "error": error, "result": result}
     write_json(path, {**content, "digest": digest(content)})
 
 
@@ -290,9 +290,9 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
                 f"but the one at {worker} says {type(answer).__name__}: {answer}; install both"
             )
         version, code, sees = answer
-        if (version, code) != (__version__, source_digest()):
+        if (version, code) != (RELEASE, source_digest()):
             raise InputError(
-                f"expected modeharvest {__version__} with the code {source_digest()[:12]} on all "
+                f"expected modeharvest {RELEASE} with the code {source_digest()[:12]} on all "
                 f"workers of {scheduler}, got {version} with {code[:12]} on the one at {worker}; "
                 "install the same there"
             )
@@ -307,4 +307,4 @@ def handshake(function: str, mark: str) -> tuple[str, str, bool]:
     """A worker's version, code digest, and whether it can write to the folder of ``mark``."""
     named(function)
     sees = Path(mark).exists() and os.access(Path(mark).parent, os.W_OK)
-    return __version__, source_digest(), sees
+    return RELEASE, source_digest(), sees

@@ -23,7 +23,7 @@ from modeharvest.fem.bloch.modes import ModeSet
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell
 from modeharvest.fem.lattice.options import Wave, wave_of
-from modeharvest.util import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
@@ -87,7 +87,7 @@ def real_modes(
         shapes=np.concatenate(shapes),
         load=state.load,
         gradient=state.gradient,
-        info={**(info or {}), "copies": [m, n], "versions": {"modeharvest": __version__}},
+        info={**(info or {}), "copies": [m, n], "versions": {"modeharvest": RELEASE}},
         origin=_origin(cell.cell, places),
     )
 

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from modeharvest.util import __version__
-
 TYPE_CHECKING = False  # typing's own takes longer to import than everything here
 if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from typing import Any
@@ -36,6 +34,8 @@ if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from modeharvest.runs.case import shipped_solution
     from modeharvest.runs.photographs.pipeline import harvest
 
+    __version__: str
+
 __all__ = [
     "Ansatz", "Experiment", "ImagePair", "ImagingSpec", "Ogden", "Result", "Solution", "Specimen",
     "__version__", "best_fit", "correlate", "harvest", "make_images", "run", "score",
@@ -54,6 +54,10 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Load a public name from its module when it is first used."""
+    if name == "__version__":  # git may have to be asked
+        from modeharvest.util import version
+
+        return version()
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

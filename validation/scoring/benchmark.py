@@ -31,7 +31,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.util import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util import files as disk
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -134,7 +134,7 @@ def set_record(form: str, files: Mapping[str, Any], **content: Any) -> dict[str,
         "format": form,
         "id": digest(files)[:12],
         "licence": "CC-BY-4.0",
-        "made_with": f"modeharvest {__version__}",
+        "made_with": f"modeharvest {RELEASE}",
         **content,
         "returned": RETURNED,
         "files": dict(files),

@@ -61,11 +61,11 @@ def found_version(name: str) -> str:
 
 def examine() -> Diagnosis:
     """Collect what is known about this machine and installation."""
-    from modeharvest.util import __version__
+    from modeharvest.util import version as own_version
     from modeharvest.util.machine import available_bytes
 
     machine = (
-        ("modeharvest", __version__, str(Path(__file__).parents[1])),
+        ("modeharvest", own_version(), str(Path(__file__).parents[1])),
         ("Python", platform.python_version(), sys.executable),
         ("system", platform.platform(terse=True), platform.machine()),
         ("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity")

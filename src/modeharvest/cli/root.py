@@ -19,7 +19,7 @@ from modeharvest.cli.demo import ABOUT, EXIT_CODES, FIRST, demo
 from modeharvest.cli.doctor import doctor
 from modeharvest.cli.fields import animate, export, gauges
 from modeharvest.cli.sharing import COMMANDS, share
-from modeharvest.util import __version__
+from modeharvest.util import version as own_version
 from modeharvest.util.machine import is_first
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ app.add_typer(benchmark_app, name="benchmark", rich_help_panel="Accuracy of a me
 
 def _version(wanted: bool) -> None:
     if wanted:
-        print(__version__)
+        print(own_version())
         raise typer.Exit
 
 
@@ -97,7 +97,7 @@ def _common(
     ] = False,
 ) -> None:
     if context.invoked_subcommand is None:
-        print(FIRST.format(version=__version__))
+        print(FIRST.format(version=own_version()))
 
 
 def main() -> None:

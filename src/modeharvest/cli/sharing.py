@@ -73,7 +73,8 @@ def leaderboard(
     with bars() as progress:
         board = ranked(codes, truth, out, progress)
     for n, row in enumerate(board["codes"], 1):
-        print(f"{n}. {row['code']}: rms {row['rms_px']:.3g} px, mean of {row['counted']} cases")
+        of = f"rms {row['rms_px']:.3g} px, mean of {row['counted']} cases" if row["counted"] else ""
+        print(f"{n}. {row['code']}: {of}" if of else f"   {row['code']}: no case that counts")
     print(f"report: {out / 'report.html'}")
     refuse(board["refused"])
 

@@ -35,7 +35,7 @@ from typing import Any, Generic, TypeVar
 
 import psutil
 
-from modeharvest.util import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util.errors import InputError, WriteError
 from modeharvest.util.files import make_folder, read_json, remove_orphans, sha256_of, write_json
 from modeharvest.util.machine import on_first
@@ -49,7 +49,7 @@ R = TypeVar("R")
 
 def versions(*libraries: str) -> dict[str, str]:
     """Versions of modeharvest, of Python, and of installed libraries, by their names."""
-    own = {"modeharvest": __version__, "python": platform.python_version()}
+    own = {"modeharvest": RELEASE, "python": platform.python_version()}
     return own | {name: version(name) for name in libraries}
 
 
@@ -153,7 +153,8 @@ class Stages:
     def _forget(self, name: str) -> None:
         """Remove a stage's record, then its files, which belong to other inputs."""
         record = self._record()
-        stage = record.pop(name, {"files": {}})
+        if (stage := record.pop(name, None)) is None:
+            return
         write_json(self.folder / RECORD, record)
         for path in map(Path, stage["files"]):
             if not path.is_absolute() and ".." not in path.parts:  # whatever the record says
@@ -288,7 +289,8 @@ _of_this_thread = threading.local()
 def exclusive(folder: Path | str) -> Iterator[None]:
     """Lock a folder for this process; the same thread may lock it again within the block.
 
-    The operating system releases the lock when its holder ends, however it ends. On file systems
+    The operating system releases the lock when its holder ends, however it ends; folders made for
+    it in which nothing was written are removed. On file systems
     without locks (some network drives, Windows) the file ``.lock`` alone decides; it is ignored
     only if it names a process of this machine that has ended. Where nothing can be written nothing
     is locked. Under mpirun rank 0 holds the lock for all. Raises InputError if another process
@@ -315,9 +317,11 @@ class _Lock:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: int | None = None
+        self._made: list[Path] = []
 
     def acquire(self) -> None:
         try:
+            self._made = [folder for folder in self._path.parents if not folder.exists()]
             make_folder(self._path.parent)
             while self._file is None:
                 self._file = self._locked()
@@ -337,6 +341,9 @@ class _Lock:
         if os.name == "posix":  # last: opening this name now makes a new file
             os.close(self._file)
         self._file = None
+        with suppress(OSError):  # where nothing was written, no folder is left
+            for folder in self._made:
+                folder.rmdir()
 
     def _locked(self) -> int | None:
         """The file, opened and locked; None if its holder has just removed it."""

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from matplotlib.path import Path
 from numpy.typing import NDArray
-from skimage.measure import approximate_polygon, find_contours
 
 from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.lattice.periodicity import find_periodicity
@@ -77,6 +76,8 @@ def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> MeshB
     at most this area [mm²] are left out. The boundary deviates from the mask's edge by at most
     about a third of a cell, and is empty for an empty mask.
     """
+    from skimage.measure import approximate_polygon, find_contours  # a second to load
+
     factor = max(1, round(max(grid.shape) / CELLS))
     cells = grid.binned(factor)
     # Padding closes the contours of material that touches the image's edge.

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from modeharvest.util import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
 from modeharvest.util.stages import digest
@@ -58,7 +58,7 @@ def write_crate(
         raise InputError(f"expected a licence ({known}) or its https:// address, got {licence!r}")
     require_writable(folder)
     files = [_file(folder, path) for path in _members(folder)]
-    software = {"modeharvest": __version__, **info.get("versions", {})}
+    software = {"modeharvest": RELEASE, **info.get("versions", {})}
     made = [_software(library, version) for library, version in software.items()]
     title = name or str(info.get("title") or f"Benchmark {info.get('id', folder.name)}")
     units = [*_quantities(info), *_columns(folder / "table.csv")]
@@ -76,7 +76,7 @@ def write_crate(
         "variableMeasured": [_to(unit) for unit in units],
         "mentions": {"@id": "#made"},
     }
-    made_by = _RUN if "snapshots" in info else f"made with modeharvest {__version__}"
+    made_by = _RUN if "snapshots" in info else f"made with modeharvest {RELEASE}"
     command = str(info.get("command") or made_by)
     action = _entity("CreateAction", "#made", name=command, description=command)
     action |= {"instrument": [_to(library) for library in made], "result": {"@id": "./"}}

@@ -102,8 +102,9 @@ def leaderboard(
     """Grade a folder of submissions, ``CODE/CASE.*``; writes a page for each case and one for all.
 
     A code's score is the geometric mean of its rms errors [px] over the cases in which it covers
-    at least half of the material; codes with more such cases rank first. Returns the content of
-    ``leaderboard.json``. InputError if nothing can be graded.
+    at least half of the material; codes with more such cases rank first, those without any come
+    last, without a rank. Returns the content of ``leaderboard.json``. InputError if no file can be
+    graded.
     """
     from modeharvest.report.model.content import Card, Report, ReportTable, Section
     from modeharvest.report.model.output import write_page
@@ -134,8 +135,8 @@ def leaderboard(
             numbers = {"rms_px": one.everywhere.rms_px, "covered": one.covered}
             found[one.source][name] = numbers
     rows = [{"code": code, **_overall(cases), "cases": cases} for code, cases in found.items()]
-    rows = sorted((r for r in rows if r["cases"]), key=lambda r: (-r["counted"], r["rms_px"]))
-    if not rows:
+    rows.sort(key=lambda r: (-r["counted"], r["rms_px"] or 0.0, not r["cases"]))
+    if not any(found.values()):
         raise InputError(
             f"expected files CODE/CASE.csv in {handed_in}, got none to grade"
             + "".join(f"; {why}" for why in [*refused.values()][:_REASONS])
@@ -143,7 +144,7 @@ def leaderboard(
         )
     board = {"set": known["id"], "title": known["title"], "codes": rows, "refused": refused}
     columns = ["code", "cases that count", "geometric mean of rms [px]", *known["cases"]]
-    cells = [[f"{n}. {r['code']}", r["counted"], r["rms_px"],
+    cells = [[f"{n}. {r['code']}" if r["counted"] else r["code"], r["counted"], r["rms_px"],
               *(r["cases"].get(c, {}).get("rms_px") for c in known["cases"])]
              for n, r in enumerate(rows, 1)]  # fmt: skip
     what = [[n, c["what"], 100 * c["nominal_strain"]] for n, c in known["cases"].items()]
@@ -155,7 +156,8 @@ def leaderboard(
     report = Report(
         kind="leaderboard", title=known["title"],
         lead=f"Set {known['id']}. Rms errors in px per component, over the points that each code "
-        f"returns; a case counts if its points cover {100 * ENOUGH_COVERED:g} % of the material.",
+        f"returns; a case counts if its points cover {100 * ENOUGH_COVERED:g} % of the material. "
+        "Codes without a number have no case that counts.",
         sections=[Section("ranking", "Ranking", cards)],
         warnings=list(refused.values()), command="modeharvest benchmark leaderboard CODES "
         "--truth DIR-truth --out DIR", files=graded,
@@ -168,5 +170,5 @@ def leaderboard(
 def _overall(cases: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     """The number of cases that count, and the geometric mean of their errors [px]."""
     errors = [max(c["rms_px"], 1e-9) for c in cases.values() if c["covered"] >= ENOUGH_COVERED]
-    rms = float(np.exp(np.mean(np.log(errors)))) if errors else float("inf")
+    rms = float(np.exp(np.mean(np.log(errors)))) if errors else None
     return {"counted": len(errors), "rms_px": rms}

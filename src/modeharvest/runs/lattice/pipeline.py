@@ -19,7 +19,7 @@ from modeharvest.idic.spectra.mode_family import write_family
 from modeharvest.runs.lattice import results
 from modeharvest.runs.lattice.case import FileLattice, LatticeCase
 from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, LatticeRun, PeriodicField
-from modeharvest.util import __version__
+from modeharvest.util import RELEASE
 from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, reading, sha256_of, write_json
 from modeharvest.util.progress import counted, named
@@ -327,7 +327,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             if "study" in done else None,  # whose rows are complete
             notes=[*unit.notes, *ligament_notes(unit), *filter(None, [why_no_modes])],
             exports=results.exports_in(self.folder),
-            versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
+            versions={"modeharvest": RELEASE, "dolfinx": dolfinx_api.VERSION},
         )  # fmt: skip
 
     @cached_property
