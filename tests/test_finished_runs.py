@@ -14,9 +14,15 @@ from scipy.io import loadmat
 from test_cli import called, error_line
 from test_gauges import GRID, MESH, affine, result
 
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.finite_element.files import Given, write_csv, write_result
 from modeharvest.idic.local.field import read_field
+from modeharvest.idic.modes import square_family
 from modeharvest.idic.photograph.finished import FinishedRun
+from modeharvest.idic.result import Covariance, Result
+from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.report.figures.maps import ColourScale
 from modeharvest.report.figures.on_photographs import draw_on_photograph, write_pdf
@@ -98,8 +104,82 @@ def test_lengths_in_pixels_stay_so(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.column_stack([field.x, field.y]), MESH.nodes, atol=1e-6)
         np.testing.assert_allclose(field.u, affine(STRETCH), atol=1e-8)
         assert field.convention == "modeharvest: in px, y down, first pixel 0"
-    with pytest.raises(InputError, match="expected the size of a pixel for gom"):
-        FinishedRun.read(tmp_path / "a.h5").export("gom", tmp_path / "out", 3)
+    finished = FinishedRun.read(tmp_path / "a.h5")
+    with pytest.raises(InputError, match=r"expected the size of a pixel for gom.*--pixel-size"):
+        finished.export("gom", tmp_path / "out", 3)
+    for form, axis in (("matchid", "down"), ("npz", ""), ("mat", "down"), ("ncorr", "down")):
+        (path,) = finished.export(form, tmp_path / form, 4)
+        field = read_field(path, grid)
+        x, y, u = field.valid_points()
+        true = np.column_stack([x, y]) @ (STRETCH - np.eye(2)).T
+        inside = np.hypot(x, y) < 2.5  # maps hold edge pixels whose centres are beside the mesh
+        np.testing.assert_allclose(u[inside], true[inside], atol=1e-9)
+        assert axis in field.convention
+    with pytest.raises(InputError, match="expected lengths in mm, got a measurement in px"):
+        read_field(*finished.export("vtu", tmp_path / "vtu", 4), grid)
+
+
+@pytest.mark.parametrize("form", ["gom", "matchid", "npz", "mat", "csv", "vic2d"])
+def test_the_size_of_a_pixel_may_come_later(tmp_path: Path, form: str) -> None:
+    grid = replace(GRID, pixel_size=1.0, x0=-60.0, y0=40.0)
+    write_result(tmp_path / "a.h5", replace(result(affine(STRETCH)), grid=grid), Given("px"))
+    finished = FinishedRun.read(tmp_path / "a.h5")
+    (path,) = finished.export(form, tmp_path, 4, 0.02)
+    field = read_field(path, PixelGrid.centred(*grid.shape, 0.02))
+    x, y, u = field.valid_points()
+    np.testing.assert_allclose(u, np.column_stack([x, y]) @ (STRETCH - np.eye(2)).T, atol=1e-9)
+    assert abs(x).max() == pytest.approx(0.02 * np.abs(MESH.nodes[:, 0]).max(), abs=0.08)
+    write_result(tmp_path / "b.h5", result(affine(STRETCH)))
+    with pytest.raises(InputError, match="got a run measured in mm"):
+        FinishedRun.read(tmp_path / "b.h5").export(form, tmp_path, 4, 0.02)
+
+
+def test_maps_for_matlab_are_read_back(run: Path, tmp_path: Path) -> None:
+    FinishedRun.read(run).export("mat", tmp_path, 3)
+    field = read_field(tmp_path / "b.mat", GRID)
+    x, y, u = field.valid_points()
+    np.testing.assert_allclose(u, np.column_stack([x, y]) @ (STRETCH - np.eye(2)).T, atol=1e-9)
+    assert field.sd is not None
+
+
+def test_photographs_of_a_harvest_are_in_the_order_of_the_test(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "whole_field").mkdir()
+    for new, old in (("frame_10", "a"), ("frame_2", "b")):
+        (tmp_path / f"whole_field/{new}.h5").write_bytes((run / f"results/{old}.h5").read_bytes())
+    names = ["frame_2", "frame_10"]
+    write_json(tmp_path / "summary.json", {"frames": [{"name": name} for name in names]})
+    assert [*FinishedRun.read(tmp_path).files] == names
+
+
+def test_a_harvest_without_whole_displacements_is_exported_by_its_modes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid = PixelGrid.centred(60, 80, 0.05)
+    ansatz = Ansatz.on(Box.centred(3.6, 2.8), [(square_family(), Box.centred(3.0, 2.0))], 1.0)
+    a = ansatz.initial_guess(0.05, 2.0)
+    covariance = np.diag(np.full(ansatz.size, 1e-8))
+    known = Result(ansatz, grid, a, covariance, 1.0, 9, 0, Outcome.CONVERGED, 1.0)
+    known = replace(known, errors=Covariance(0.01 * covariance, covariance))
+    mask = np.zeros(grid.shape, dtype=bool)
+    mask[8:50, 10:70] = True
+    for name in ("results", "prepared"):
+        (tmp_path / name).mkdir()
+    known.write(tmp_path / "results/f.json")
+    write_json(tmp_path / "results/f_start.json", {"text": []})
+    write_image(tmp_path / "prepared/reference_mask.tif", mask)
+    for form in ("vic2d", "ncorr", "gom", "csv"):
+        out = tmp_path / form
+        assert called(monkeypatch, "export", tmp_path, "--as", form, "--out", out) == 0
+        (path,) = out.iterdir()
+        field = read_field(path, grid)
+        x, y, u = field.valid_points()
+        np.testing.assert_allclose(u, ansatz.displacement_at(a, np.column_stack([x, y])), atol=1e-9)
+        assert len(x) == mask[::5, ::5].sum()
+        if form == "csv":
+            assert field.sd is not None
+            assert field.sd.min() > 1e-5  # by model error
+    assert called(monkeypatch, "export", tmp_path, "--as", "vtu", "--out", tmp_path) == 2
+    assert "harvest with --whole-field" in error_line(capsys)
 
 
 def test_gauges_of_a_run(

@@ -128,8 +128,25 @@ def test_light_that_changes_along_the_material_is_reported(tmp_path: Path) -> No
     shown.save(tmp_path, {"frame_1": truth(0.03)})
     light, frame = np.linspace(0.93, 1.0, shown.grid.cols), tmp_path / "frame_1.tif"
     tifffile.imwrite(frame, np.uint8(light * tifffile.imread(frame)))
-    for name, more, count in (("without", "", 1), ("with", "gain_degree = 1\n", 0)):
+    even = "gain_degree = 0\noffset_degree = 0\n"
+    for name, more, count in (("even", even, 1), ("default", "", 0)):
         (tmp_path / f"{name}.toml").write_text(experiment("total") + more)
         case = PhotographCase.read(tmp_path / f"{name}.toml")
         (row,) = HarvestRun(case, tmp_path / name).harvest().numbers
         assert sum("light changed" in text for text in row["warnings"]) == count
+
+
+@pytest.mark.parametrize("fade", [0.975, 0.6])
+def test_light_that_slopes_and_fades_is_not_taken_for_displacement(
+    tmp_path: Path, fade: float
+) -> None:
+    """Also below the change of 3 % from which on photographs are given the reference's light."""
+    shown = photographed()
+    shown.save(tmp_path, {"frame_1": truth(0.06)})
+    light, frame = fade * np.linspace(0.8, 1.0, shown.grid.rows), tmp_path / "frame_1.tif"
+    tifffile.imwrite(frame, np.uint8(np.rint(light[:, None] * tifffile.imread(frame))))
+    (tmp_path / "case.toml").write_text(experiment("total"))
+    run = HarvestRun(PhotographCase.read(tmp_path / "case.toml"), tmp_path / "out")
+    (measured,) = run.results().values()
+    off = (measured.result.displacement() - truth(0.06)(shown.points))[shown.mask]
+    assert np.sqrt(np.mean(off**2)) / PIXEL < 0.03

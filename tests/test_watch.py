@@ -237,6 +237,89 @@ def test_what_a_version_with_other_columns_left_is_measured_again(
     assert len(again.rows) == 1
 
 
+def test_a_photograph_that_was_replaced_is_measured_again(
+    watched: tuple[Path, WatchedTest], experiment: Path, tmp_path: Path
+) -> None:
+    """In its own place; while the test runs, or after a stop."""
+    shots, out, old = tmp_path / "shots", tmp_path / "out", experiment.parent / "shots"
+    shots.mkdir()
+    for k in (1, 2, 3):
+        shutil.copy2(old / f"frame_{k}.tif", shots)
+    (shots / "frame_4.tif").write_bytes(b"II*\0 and no more")
+    long_ago = time.time() - 60.0
+    os.utime(shots / "frame_4.tif", (long_ago, long_ago))
+    lines: list[str] = []
+
+    def show(line: str) -> None:
+        lines.append(line)
+        if line.startswith("frame_4.tif: not used"):
+            shutil.copy2(old / "frame_4.tif", shots)
+            os.utime(shots / "frame_4.tif", (long_ago, long_ago))  # of another size
+            shutil.copy2(old / "frame_5.tif", shots / "frame_2.tif")
+            os.utime(shots / "frame_2.tif", (long_ago, long_ago))
+            (shots / "frame_3.tif").unlink()  # its measurement stays
+
+    test = watch(experiment, out, shots, until_still=0.4, show=show)
+    assert [row["name"] for row in test.rows] == [f"frame_{k}.tif" for k in (1, 2, 3, 4)]
+    strains = [row["strain"] for row in test.rows]
+    assert strains == pytest.approx(list(STRAINS[[0, 4, 2, 3]]), abs=5e-4)
+    assert test.skipped == []
+    assert sum("frame_2.tif, changed: " in line for line in lines) == 1
+
+    shutil.copy2(old / "frame_2.tif", shots)
+    (shots / "frame_1.tif").rename(shots / "frame_0.tif")
+    os.utime(shots / "frame_4.tif")  # touched, but the same
+    lines.clear()
+    again = watch(experiment, out, shots, until_still=0.4, show=lines.append)
+    assert [row["name"] for row in again.rows] == [f"frame_{k}.tif" for k in (0, 2, 3, 4)]
+    assert again.rows[1]["strain"] == pytest.approx(STRAINS[1], abs=5e-4)
+    assert len(lines) == 2
+    assert again.predictions == follow_growth(again.columns)
+
+
+def test_the_last_photograph_is_on_the_page_while_nothing_comes(
+    experiment: Path, tmp_path: Path
+) -> None:
+    """Though it was measured soon after the one before; also where the folder goes."""
+    shots, out = tmp_path / "shots", tmp_path / "out"
+    shots.mkdir()
+    for k in (1, 2):
+        shutil.copy2(experiment.parent / f"shots/frame_{k}.tif", shots)
+    seen = []
+
+    def look() -> None:
+        time.sleep(1.0)
+        deadline = time.monotonic() + 60.0
+        while time.monotonic() < deadline and len(seen) < 2:
+            if (out / "watch.json").is_file():
+                seen[:] = json.loads((out / "watch.json").read_text())["frames"]
+            time.sleep(0.05)
+        shutil.rmtree(shots)
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    watch(experiment, out, shots, until_still=5.0)
+    thread.join()
+    assert len(seen) == 2
+
+
+def test_another_reference_ends_the_watch(experiment: Path, tmp_path: Path) -> None:
+    for path in (experiment, experiment.parent / "reference.tif"):
+        shutil.copy2(path, tmp_path)
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    for k in (1, 2):
+        shutil.copy2(experiment.parent / f"shots/frame_{k}.tif", shots)
+
+    def show(line: str) -> None:
+        if line.startswith("frame_1"):
+            os.utime(tmp_path / "reference.tif")
+
+    with pytest.raises(InputError, match=r"got another in .*reference\.tif; start again"):
+        watch(tmp_path / experiment.name, tmp_path / "out", until_still=0.2, show=show)
+    assert (tmp_path / "out/watch.html").is_file()
+
+
 def test_a_file_half_written_is_waited_for(tmp_path: Path) -> None:
     shots = tmp_path / "shots"
     shots.mkdir()
@@ -253,7 +336,7 @@ def test_a_file_half_written_is_waited_for(tmp_path: Path) -> None:
 
     thread = threading.Thread(target=camera)
     thread.start()
-    (found,) = arriving(shots, tmp_path / "whole.tif", WatchedTest(), 3.0)
+    (found,) = arriving(shots, tmp_path / "whole.tif", WatchedTest(), 0.4)  # shorter than that
     assert found.read_bytes() == content
     thread.join()
 

@@ -6,6 +6,7 @@ the code has a place for them, as one number for both components.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from modeharvest.idic.local.field import LocalField, write_field
+from modeharvest.idic.local.field import LocalField, columns_of, write_field
 from modeharvest.idic.local.formats import layouts
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import FloatArray
@@ -42,17 +43,22 @@ def export_field(
     """
     if form not in FORMATS:
         raise InputError(f"expected a format among {', '.join(FORMATS)}, got {form!r}")
-    if unit == "px" and form in ("matchid", "gom", "csv", "npz", "mat"):
-        raise InputError(f"expected the size of a pixel for {form}, in mm; measure with it")
+    if unit == "px" and form == "gom":
+        raise InputError("expected the size of a pixel for gom, in mm; give --pixel-size")
     path = Path(path).with_suffix(FORMATS[form])
-    if form in (texts := layouts()["written"]):
-        _write_text(path, texts[form], _numbers(field, grid))
-    elif form in ("csv", "npz"):
-        write_field(path, field)
+    texts, in_px = layouts()["written"], f"{form}_px"
+    if form in texts:
+        of_unit = in_px if unit == "px" and in_px in texts else form
+        _write_text(path, texts[of_unit], _numbers(field, grid))
     elif form == "davis":
         _write_davis(path, *_lattice(path, field, grid))
+    elif form in ("csv", "npz"):
+        write_field(path, field, grid if unit == "px" else None)
     else:
-        content = _of_matlab(field) if form == "mat" else _of_ncorr(path, field, grid, unit)
+        content = _of_ncorr(path, field, grid, unit)
+        if form == "mat":
+            columns = columns_of(field, grid if unit == "px" else None)
+            content = {re.sub(r"\W+", "_", head).strip("_"): of for head, of in columns.items()}
         with atomic(path) as part:
             savemat(part, content, appendmat=False, do_compression=True, oned_as="column")
     return path
@@ -120,11 +126,3 @@ def _of_ncorr(path: Path, field: LocalField, grid: PixelGrid, unit: str) -> dict
               for name, values in zip("uv", maps, strict=True)}  # fmt: skip
     info = {"pixtounits": grid.pixel_size, "units": unit, "spacing": step - 1, "type": "regular"}
     return {"data_dic_save": {"displacements": frame, "dispinfo": info}}
-
-
-def _of_matlab(field: LocalField) -> Columns:
-    """The columns that modeharvest writes [mm], under names that are valid in MATLAB."""
-    sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
-    names = ("x_mm", "y_up_mm", "u_mm", "v_up_mm", "sd_u_mm", "sd_v_mm", "valid")
-    arrays = (field.x, field.y, *field.u.T, *sd.T, field.good.astype(np.float64))
-    return dict(zip(names, arrays, strict=True))

@@ -139,6 +139,11 @@ class LocalField:
             self.convention,
         )  # fmt: skip
 
+    def scaled(self, factor: float) -> LocalField:
+        """The same field with all lengths times a factor, such as mm/px."""
+        sd = None if self.sd is None else factor * self.sd
+        return replace(self, x=factor * self.x, y=factor * self.y, u=factor * self.u, sd=sd)
+
     def less(self, displacement: Callable[[FloatArray], FloatArray]) -> LocalField:
         """The microfluctuation field w = u − model, with the field's own standard deviations.
 
@@ -179,7 +184,7 @@ def field_between(
 
 
 _UNITS, _AXES = ("px", "mm"), ("up", "down")
-_WRITTEN = ("x [mm]", "y up [mm]", "u [mm]", "v up [mm]", "sd_u [mm]", "sd_v [mm]", "valid")
+_WRITTEN = "x [{u}]", "y {y} [{u}]", "u [{u}]", "v {y} [{u}]", "sd_u [{u}]", "sd_v [{u}]", "valid"
 
 
 def read_field(
@@ -242,23 +247,33 @@ def read_field(
     return LocalField(x, y, u, ok, sd, source=Path(path).name, convention=text)
 
 
-def write_field(path: Path | str, field: LocalField) -> None:
+def write_field(path: Path | str, field: LocalField, px: PixelGrid | None = None) -> None:
     """Write a field as CSV or NPZ, which :func:`read_field` reads without any options.
 
-    Raises InputError if the name does not end in .csv or .npz.
+    ``px``: the pixels, for columns in pixels, y down. InputError if the name does not end in .csv
+    or .npz.
     """
-    sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
-    data = np.column_stack([field.x, field.y, field.u, sd, field.good])
-    suffix = Path(path).suffix.lower()
+    columns, suffix = columns_of(field, px), Path(path).suffix.lower()
     if suffix not in (".csv", ".npz"):
         raise InputError(f"expected a field to be written as .csv or .npz, got {path}")
     with atomic(path) as part:
         if suffix == ".npz":
             with open(part, "wb") as file:
-                np.savez(file, **dict(zip(_WRITTEN, data.T, strict=True)))
+                np.savez(file, **columns)  # type: ignore[arg-type]
         else:
-            formats = ["%.9g"] * 6 + ["%d"]
-            np.savetxt(part, data, formats, ",", header=",".join(_WRITTEN), comments="")
+            data, formats = np.column_stack([*columns.values()]), ["%.9g"] * 6 + ["%d"]
+            np.savetxt(part, data, formats, ",", header=",".join(columns), comments="")
+
+
+def columns_of(field: LocalField, px: PixelGrid | None = None) -> dict[str, FloatArray]:
+    """All columns of a field under names that state units and axis; ``px`` as above."""
+    x, y, u = field.x, field.y, field.u
+    sd, size, sign = np.full_like(u, np.nan) if field.sd is None else field.sd, 1.0, 1.0
+    if px is not None:
+        (y, x), size, sign = px.to_px(x, y), px.pixel_size, -1.0
+    unit, axis = ("mm", "up") if px is None else ("px", "down")
+    data = x, y, u[:, 0] / size, sign * u[:, 1] / size, *(sd.T / size), field.good.astype(float)
+    return dict(zip((head.format(u=unit, y=axis) for head in _WRITTEN), data, strict=True))
 
 
 def _declared(

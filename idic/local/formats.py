@@ -29,6 +29,17 @@ from modeharvest.util.files import encoding_of, open_hdf5
 _LENGTHS = {"px": "px", "pixel": "px", "mm": "mm"}  # in files of DaVis
 _CSV_PX = {"x": "column", "y": "row", "u": "u [px]", "v": "v up [px]", "sd_u": "sd_u [px]",
            "sd_v": "sd_v [px]"}  # fmt: skip
+_MAT_PX, _MAT_MM = (
+    {
+        "x": "column",
+        "y": "row",
+        "u": f"u_{unit}",
+        "v": f"v_up_{unit}",
+        "sd_u": f"sd_u_{unit}",
+        "sd_v": f"sd_v_{unit}",
+    }
+    for unit in ("px", "mm")
+)
 _DISPLACEMENTS, _INFO = "data_dic_save/displacements", "data_dic_save/dispinfo/"
 
 
@@ -167,9 +178,13 @@ def _cased(table: Table, *patterns: tuple[str, str]) -> Table | None:
 
 def _own(path: Path, table: Table, units: str | None, y_axis: str | None) -> Known:
     """Displacements that modeharvest measured at the nodes of a mesh."""
-    if set(_CSV_PX.values()) <= set(table):  # x and y [px] count from the middle of the image
-        own = {role: table[name] for role, name in _CSV_PX.items()}
-        return own | {"v": -own["v"]}, Convention("modeharvest", "px", "px", "down")
+    for heads in (_CSV_PX, _MAT_PX):
+        if set(heads.values()) <= set(table):  # x and y [px] count from the middle of the image
+            own = {role: table[name] for role, name in heads.items()}
+            return own | {"v": -own["v"]}, Convention("modeharvest", "px", "px", "down")
+    if set(_MAT_MM.values()) <= set(table):
+        own = {role: table[name] for role, name in _MAT_MM.items()}
+        return own | {"v": -own["v"]}, Convention("modeharvest", "px", "mm", "down")
     if not {"nodes", "cells", "displacement", "standard_deviation"} <= set(table):
         return None
     with open_hdf5(path, "a measured displacement (HDF5)", "measure again") as file:

@@ -211,6 +211,11 @@ def _read_vtk(path: Path) -> Table:
     mesh = read_any_mesh(path)
     vectors = {n: v for n, v in mesh.point_data.items() if v.ndim == 2 and v.shape[1] in (2, 3)}
     named = [n for n in vectors if n.lower().removesuffix("_mm") in _VECTORS] or list(vectors)
+    if "displacement_px" in vectors:
+        raise InputError(
+            f"{path}: expected lengths in mm, got a measurement in px; give the CSV or HDF5 file "
+            "of the same name, or measure with --pixel-size"
+        )
     if len(named) != 1:
         raise InputError(
             f"{path}: expected one vector at the points, named u or displacement, got "

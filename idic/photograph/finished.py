@@ -15,8 +15,14 @@ from modeharvest.idic.finite_element import files as nodal
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.export import export_field
 from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.result import FORMAT as RESULT_FORMAT
+from modeharvest.idic.result import Result
+from modeharvest.idic.uncertainty.covariance import propagated_sd
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.photographs.files import read_mask
 from modeharvest.imaging.photographs.photograph import read_photograph
-from modeharvest.util.arrays import FloatArray, FloatImage
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, make_folder, open_hdf5, read_json
 from modeharvest.util.typed import nearest
@@ -27,21 +33,29 @@ class FinishedRun:
     """Results of ``measure``, ``harvest`` or ``run`` in a folder."""
 
     files: dict[str, Path]
-    """Files of the displacements (HDF5), by image name, in the order of the test."""
+    """Files of the whole displacements (HDF5), or of correlations alone (JSON), by image name, in
+    the order of the test."""
     pictures: dict[str, Path]
     """Photographs by image name, where there is one."""
     unit: str
     """Unit of lengths, "mm" or "px"."""
 
     @classmethod
-    def read(cls, place: Path | str, photographs: Sequence[Path] = ()) -> FinishedRun:
+    def read(
+        cls, place: Path | str, photographs: Sequence[Path] = (), correlations: bool = False
+    ) -> FinishedRun:
         """Open a run's folder, or a file; ``photographs``: of all images, if not the run's own.
 
+        ``correlations``: whether v0 and v1 phi1 will do where no whole displacement was measured.
         InputError if nothing was measured there.
         """
         place = Path(place)
         found = [p for name in ("results", "whole_field") for p in (place / name).glob("*.h5")]
         paths = [p for p in [*sorted(found), place] if p.is_file() and _is_nodal(p)]
+        if correlations and not paths:
+            unknowns = "results/*.json", "correlation/result_*.json"
+            either = [p for name in unknowns for p in sorted(place.glob(name))]
+            paths = [p for p in either if read_json(p).get("format") == RESULT_FORMAT]
         if not paths:
             raise InputError(
                 "expected a folder of 'measure', or of whole displacements of 'harvest' or 'run', "
@@ -49,7 +63,9 @@ class FinishedRun:
             )
         files, images = {path.stem: path for path in paths}, []
         if (record := place / "summary.json").is_file():
-            images = [i for i in read_json(record).get("images", ()) if i.get("name") in files]
+            listed = read_json(record)  # of measure, or of harvest
+            listed = listed.get("images") or listed.get("frames") or ()
+            images = [i for i in listed if i.get("name") in files]
             files = {i["name"]: files[i["name"]] for i in images} or files
         known = {name: place / "prepared" / f"{name}.tif" for name in files}
         known |= {i["name"]: Path(i["file"]) for i in images if i.get("file")}
@@ -57,8 +73,10 @@ class FinishedRun:
             if (got := len(photographs)) != len(files):
                 raise InputError(f"expected a photograph for each of {len(files)}, got {got}")
             known = dict(zip(files, photographs, strict=True))
-        with open_hdf5(paths[0], "a measured displacement (HDF5)") as file:
-            unit = str(file.attrs["unit"])
+        unit = "mm"
+        if paths[0].suffix == ".h5":
+            with open_hdf5(paths[0], "a measured displacement (HDF5)") as file:
+                unit = str(file.attrs["unit"])
         return cls(files, {n: p for n, p in known.items() if photographs or p.is_file()}, unit)
 
     def result(self, name: str) -> NodalResult:
@@ -82,33 +100,59 @@ class FinishedRun:
             raise InputError(f"expected a field's component, got {name!r}{nearest(name, [*known])}")
         return known[name]
 
-    def export(self, form: str, folder: Path, step: int) -> list[Path]:
+    def export(
+        self, form: str, folder: Path, step: int, pixel_size: float | None = None
+    ) -> list[Path]:
         """Write all displacements in one of ``local.export.FORMATS``, every ``step``-th pixel.
 
-        The forms with all derived fields are "csv" (at nodes), "hdf5", "vtu", "tiff", "mat" (maps).
+        The forms with all derived fields are "csv" (at nodes), "hdf5", "vtu", "tiff", "mat" (maps);
+        correlations alone have none. ``pixel_size`` [mm]: of a run that was measured in pixels.
         """
         given, written = nodal.Given(self.unit), list[Path]()
+        if pixel_size is not None and self.unit == "mm":
+            raise InputError("expected --pixel-size for lengths in px, got a run measured in mm")
         make_folder(folder)
-        for name in self.files:
-            result, path = self.result(name), folder / name
-            if form in _WHOLE:
+        for name, file in self.files.items():
+            path = folder / name
+            if file.suffix == ".json":
+                if form in ("hdf5", "vtu", "tiff"):
+                    raise InputError(f"expected whole displacements for {form}, {_MODES_ALONE}")
+                found = Result.read(file)
+                field = at_pixels_of_modes(found, _mask_of(file.parent.parent), step)
+                written.append(export_field(f"{path}.x", field, form, found.grid))
+                continue
+            result = self.result(name)
+            if form in _WHOLE and pixel_size is None:
                 suffix, write = _WHOLE[form]
                 written.append(path.with_name(name + suffix))
                 write(written[-1], result, given=given)
             elif form == "tiff":
                 written += nodal.write_maps(path, result, nodal.field_names(given), given)
-            elif form == "mat":
+            elif form == "mat" and pixel_size is None:
                 written.append(path.with_name(f"{name}.mat"))
-                fields = _components(result, self.unit).items()
-                maps = {head: result.on_pixels(one)[::step, ::step] for head, (one, _) in fields}
                 with atomic(written[-1]) as part:
+                    maps = self._maps(result, step)
                     savemat(part, maps, appendmat=False, do_compression=True)
             else:
-                field, grid = at_pixels(result, step), result.grid
-                written.append(export_field(f"{path}.x", field, form, grid, self.unit))
+                field, grid, unit = at_pixels(result, step), result.grid, self.unit
+                if pixel_size is not None:
+                    grid, unit = PixelGrid.centred(*grid.shape, pixel_size), "mm"
+                    field = field.scaled(pixel_size)
+                written.append(export_field(f"{path}.x", field, form, grid, unit))
         return written
 
+    def _maps(self, result: NodalResult, step: int) -> dict[str, FloatArray]:
+        """Maps of every ``step``-th pixel: row, column, and all fields, lengths with their unit."""
+        row, col = (step * np.indices([-(-n // step) for n in result.grid.shape])).astype(float)
+        maps = {"row": row, "column": col}
+        for head, (values, unit) in _components(result, self.unit).items():
+            up = "_up" if head == "v" else ""
+            name = f"{head}{up}_{unit}" if unit == self.unit else head
+            maps[name] = result.on_pixels(values)[::step, ::step]
+        return maps
 
+
+_MODES_ALONE = "got v0 and v1 phi1 alone; harvest with --whole-field, or choose another format"
 _WHOLE: dict[str, tuple[str, Callable[..., None]]] = {
     "csv": (".csv", nodal.write_csv), "hdf5": (".h5", nodal.write_result),
     "vtu": (".vtu", nodal.write_vtu),
@@ -123,6 +167,41 @@ def at_pixels(result: NodalResult, step: int) -> LocalField:
     on = np.isfinite(u).all(axis=1)
     sd = result.deviation_at(result.standard_deviation, points[on])
     return LocalField(points[on, 0], points[on, 1], u[on], sd=sd)
+
+
+def at_pixels_of_modes(result: Result, mask: BoolArray, step: int) -> LocalField:
+    """v0 and v1 phi1 of a correlation at the mask's pixels in every ``step``-th row and column.
+
+    Standard deviations are by model error and noise, where the result has them.
+    """
+    grid, found, errors = result.grid, list[FloatArray](), result.errors
+    known = None
+    if errors is not None:
+        known = errors.by_noise if errors.by_model_error is None else errors.by_model_error
+    x, a = grid.x[::step], result.unknowns
+    for k in range(0, grid.rows, step):
+        on, y = mask[k, ::step], grid.y[[k]]
+        if not on.any():
+            continue
+        u = result.ansatz.displacement(a, x[on], y)[0]
+        sd = np.full_like(u, np.nan)
+        if known is not None:
+            sd = propagated_sd(result.ansatz.sensitivities(a, x[on], y)[0], known)
+        found.append(np.column_stack([x[on], np.full(len(u), y[0]), u, sd]))
+    if not found:
+        raise InputError(
+            f"expected material at every {step}th pixel, got none; give a smaller step"
+        )
+    table = np.vstack(found)
+    return LocalField(
+        table[:, 0], table[:, 1], table[:, 2:4], sd=None if known is None else table[:, 4:]
+    )
+
+
+def _mask_of(folder: Path) -> BoolArray:
+    """The reference's mask of a harvest, or of a virtual experiment."""
+    prepared = folder / "prepared" / "reference_mask.tif"
+    return read_mask(prepared) if prepared.is_file() else ImageSet.read(folder / "images").mask()
 
 
 def _components(result: NodalResult, unit: str) -> dict[str, tuple[FloatArray, str]]:

@@ -178,7 +178,8 @@ def measure_whole(
         start, normalised = "blocks of the speckle", pair
         slow, _ = first_motion(geometry.region.domain, pair, first.local)
         begin = block_motion(pair, body, slow(mesh.nodes))
-    measured = displacement_from(begin, normalised, body, on_mesh, progress)
+    light = max(how.brightness.degrees, default=0)
+    measured = displacement_from(begin, normalised, body, on_mesh, progress, light)
     noise = image_noise(pair, camera)
     expected = float(np.hypot(noise.reference, noise.deformed))
     misfit = misfit_of(measured, expected, pair.reference[pair.masks[0]])

@@ -25,7 +25,9 @@ def export(
     image: Annotated[
         Path | None, typer.Option(help="Reference image, for another code's field in pixels.")
     ] = None,
-    pixel_size: Annotated[float | None, typer.Option(help="Pixel size of that image, mm.")] = None,
+    pixel_size: Annotated[
+        float | None, typer.Option(help="Pixel size, mm, of what was measured in pixels.")
+    ] = None,
 ) -> None:
     """Write measured displacements in another DIC code's format, or with all derived fields.
 
@@ -39,9 +41,10 @@ def export(
     from modeharvest.util.files import make_folder
 
     if source.is_dir() or source.suffix in (".h5", ""):
-        if image or pixel_size:
-            raise InputError("expected --image and --pixel-size for other codes' fields alone")
-        written = FinishedRun.read(source).export(form, out, step)
+        if image:
+            raise InputError("expected --image for other codes' fields alone")
+        finished = FinishedRun.read(source, correlations=True)
+        written = finished.export(form, out, step, pixel_size)
     else:
         rows, cols = (1, 1) if image is None else read_image(image).shape
         grid = PixelGrid.centred(rows, cols, pixel_size or 1.0)

@@ -411,8 +411,9 @@ class HarvestRun(StagedRun[PhotographCase]):
             own["w"] = measured_spectrum(w, cell, box)
         out = result.outside_image / max(1, result.pixels + result.outside_image)
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
-        if self._plain is None and out < 0.5 and not case.correlation.brightness.size:
-            left += uneven_light(pair, result.displacement())
+        if self._plain is None and out < 0.5:
+            degree = max(case.correlation.brightness.degrees, default=0)
+            left += uneven_light(pair, result.displacement(), degree)
         seen = geometry.mask & in_view(result, pair.grid.x, pair.grid.y) if left else geometry.mask
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,

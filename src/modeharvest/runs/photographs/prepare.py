@@ -281,7 +281,7 @@ def prepare(
             shown = _material(frame, masks.get(path.stem), window, own)
             _require_alike(own, shown, path)
             shown = _one_specimen(shown, cell_px, own)
-            if not (case.correlation.brightness.size or own.is_plain):
+            if not own.is_plain:
                 frame = _lit_as(reference, own.mask, frame, shown.mask)
             save(path.stem, frame, shown)
         except WriteError:

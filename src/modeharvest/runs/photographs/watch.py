@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -74,9 +75,11 @@ class WatchedTest:
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     """By photograph: ``name``, ``strain``, ``amplitude_mm``, its standard deviations ``sd_mm``
-    by noise and ``model_sd_mm``, ``pattern_px`` (rms of v1 phi1), ``seconds``."""
-    skipped: list[dict[str, str]] = field(default_factory=list)
-    """``name`` and ``reason`` of each photograph that was not measured."""
+    by noise and ``model_sd_mm``, ``pattern_px`` (rms of v1 phi1), ``seconds``; and of its file
+    ``sha256`` and ``state`` (:func:`_state_of`)."""
+    skipped: list[dict[str, Any]] = field(default_factory=list)
+    """``name`` and ``reason`` of each photograph that was not measured, and of its file the same.
+    """
     conclusion: str = ""
     """Why watching has ended; empty while it goes on."""
     _predicted: list[Prediction | None] = field(default_factory=list)
@@ -99,6 +102,40 @@ class WatchedTest:
         """The strain of buckling, predicted after each photograph."""
         self._predicted = follow_growth(self.columns, self._predicted)
         return self._predicted
+
+    def of_file(self, name: str) -> dict[str, Any] | None:
+        """The entry of a photograph, measured or skipped; None if there is none."""
+        return next((e for e in (*self.rows, *self.skipped) if e["name"] == name), None)
+
+    def is_known(self, path: Path) -> bool:
+        """Whether a file was measured or skipped, and is still the same or was only renamed."""
+        entry, state = self.of_file(path.name), _state_of(path)
+        if entry and entry["state"] == state:
+            return True
+        sha, entries = sha256_of(path), (*self.rows, *self.skipped)
+        same = entry if entry and entry["sha256"] == sha else None
+        for other in () if entry else entries:
+            if other["sha256"] == sha and not path.with_name(other["name"]).exists():
+                same = other
+        if same is not None:
+            same.update(name=path.name, state=state)
+        return same is not None
+
+    def put(self, entry: dict[str, Any]) -> bool:
+        """Add a photograph's entry, in place of one of the same name; whether there was one."""
+        before, wanted = (
+            self.of_file(entry["name"]),
+            self.skipped if "reason" in entry else self.rows,
+        )
+        if before in wanted:
+            wanted[wanted.index(before)] = entry
+        else:
+            wanted.append(entry)
+        for entries in (self.rows, self.skipped):
+            if before in entries and entries is not wanted:
+                entries.remove(before)
+        self._predicted = [] if before else self._predicted
+        return before is not None
 
     def summary(self) -> dict[str, Any]:
         """The results and predictions as plain JSON values."""
@@ -153,22 +190,24 @@ class QuickMeasurement:
         modes = [(family, part.cellular) for family in families]
         return Ansatz.on(part.domain, modes, cell, _DEGREES)
 
-    def measure(self, path: Path) -> dict[str, Any]:
+    def measure(self, path: Path, from_holes: bool = False) -> dict[str, Any]:
         """Measure one photograph; returns its row of :class:`WatchedTest`.
 
+        ``from_holes``: whether it isn't the next one of the test, and the last ones don't help.
         InputError if it can't be read, differs in kind from the reference, or doesn't match it.
         """
         begin = time.perf_counter()
         frame = require_alike(self.reference, read_photograph(path))
         image, mask, grid, noise = self._few
         pair = ImagePair(image, binned(frame.image, None, self.factor)[0], grid, mask)
-        result = self._from_the_last(pair)
+        result = None if from_holes else self._from_the_last(pair)
         if result is None or result.outcome in ASTRAY:
             result = self._from_holes(frame, pair)
         if result.outcome in ASTRAY:
             raise InputError(f"{path}: it doesn't match the reference ({result.outcome.value})")
         a = result.unknowns
-        self._before = (a, a if self._before is None else self._before[0])
+        if not from_holes:
+            self._before = (a, a if self._before is None else self._before[0])
         cellular = self.geometry.region.cellular
         amplitude, sd, model_sd = half_wave(result, cellular, noise)
         few = self.grid.binned(max(1, round(self._cell_px / 8)))
@@ -246,54 +285,90 @@ def watch(
     with exclusive(folder):
         measuring = QuickMeasurement(found)
         files = sha256_of(measuring.reference.path), str(where.absolute())
-        key = digest(["periodic modes", _COLUMNS, found.plain(), *files])
+        key = digest(["periodic modes, files' states", _COLUMNS, found.plain(), *files])
         test = WatchedTest.read(folder / "watch.json", key)
-        drawn = 0.0
+        drawn, is_new, reference = 0.0, True, _state_of(measuring.reference.path)
         show(f"watching {where}: open {folder / 'watch.html'}")
 
-        def save() -> None:
+        def save(after: float = 0.0) -> None:
+            nonlocal drawn, is_new
+            if not is_new or time.monotonic() - drawn < after:
+                return
+            drawn, is_new = time.monotonic(), False
             write_json(folder / "watch.json", {"key": key, **test.summary()})
             write_watch_page(folder / "watch.html", found.title, test, measuring.thumbnail)
 
         try:
-            for path in arriving(where, measuring.reference.path, test, until_still):
-                try:
-                    test.rows.append(measuring.measure(path))
-                except InputError as error:
-                    test.skipped.append({"name": path.name, "reason": str(error)})
-                    show(f"{path.name}: not used: {error}")
+            for path in arriving(where, measuring.reference.path, test, until_still, save):
+                if (now := _state_of(measuring.reference.path)) and now != reference:
+                    raise InputError(
+                        f"expected the reference as it was at first, got another in "
+                        f"{measuring.reference.path}; start again to measure all photographs anew"
+                    )
+                again, state = test.of_file(path.name) is not None, _state_of(path)
+                if not state:  # deleted; measured if it comes back
                     continue
-                show(_line(test))
-                if time.monotonic() - drawn > _PAGE_S:
-                    save()
-                    drawn = time.monotonic()
+                try:
+                    sha = sha256_of(path)
+                    entry = measuring.measure(path, again)
+                except InputError as error:
+                    entry = {"reason": str(error)}
+                except FileNotFoundError:
+                    continue
+                test.put(entry | {"name": path.name, "state": state, "sha256": sha})
+                is_new = True
+                text = (
+                    _line(test, path.name) if "strain" in entry else f"not used: {entry['reason']}"
+                )
+                show(f"{path.name}{', changed' * again}: {text}")
+                save(_PAGE_S)
             test.conclusion = f"No photograph came for {until_still:g} s."
         except KeyboardInterrupt:
             test.conclusion = "Watching was interrupted."
-        save()
+        finally:
+            is_new = True
+            save()
     return test
 
 
 def arriving(
-    folder: Path, reference: Path, test: WatchedTest, until_still: float | None
-) -> Iterator[Path]:
+    folder: Path, reference: Path, test: WatchedTest, until_still: float | None,
+    idle: Callable[[], None] = lambda: None,
+) -> Iterator[Path]:  # fmt: skip
     """Yield the photographs of a folder when they are complete, those already there first.
 
-    Ends when none has come for ``until_still`` seconds.
+    Those that were replaced come again. Ends when none has come, and none grows, for
+    ``until_still`` seconds. ``idle`` is called while nothing comes.
     """
-    seen = {row["name"] for row in test.rows} | {row["name"] for row in test.skipped}
-    seen.add(reference.name if reference.parent.absolute() == folder.absolute() else "")
-    still = time.monotonic()
+    seen, still = dict[Path, list[int]](), time.monotonic()
     while until_still is None or time.monotonic() - still < until_still:
-        names = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-        new = sorted((p for p in names if p.name not in seen and p.name[0] != "."), key=natural)
-        for path in new:
-            if _is_whole(path):
-                seen.add(path.name)
-                yield path
-                still = time.monotonic()
-        if not new:
+        new = []
+        with suppress(FileNotFoundError):  # of a folder or drive that has gone
+            new = [p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.name[0] != "."]
+        seen, count = {path: state for path, state in seen.items() if path in new}, 0
+        for path in sorted(new, key=natural):
+            state = _state_of(path)
+            if not state or seen.get(path) == state or path.absolute() == reference.absolute():
+                continue
+            count += 1
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                if _is_whole(path):
+                    seen[path] = state
+                    if not test.is_known(path):
+                        yield path
+        if count:
+            still = time.monotonic()
+        else:
+            idle()
             time.sleep(_POLL_S)
+
+
+def _state_of(path: Path) -> list[int]:
+    """Size [bytes] and time of change [ns] of a file; empty if there is none."""
+    with suppress(FileNotFoundError):
+        about = path.stat()
+        return [about.st_size, about.st_mtime_ns]
+    return []
 
 
 def _is_whole(path: Path) -> bool:
@@ -311,12 +386,12 @@ def _is_whole(path: Path) -> bool:
     return path.stat().st_mtime_ns == before.st_mtime_ns
 
 
-def _line(test: WatchedTest) -> str:
-    """Text with the last photograph's numbers, and the prediction after it."""
-    row, found = test.rows[-1], test.predictions[-1]
+def _line(test: WatchedTest, name: str) -> str:
+    """Text with a photograph's numbers, and the prediction after it."""
+    k = [row["name"] for row in test.rows].index(name)
+    row, found = test.rows[k], test.predictions[k]
     text = (
-        f"{row['name']}: {100 * row['strain']:.2f} %, pattern {row['pattern_px']:.2f} px, "
-        f"{row['seconds']:.1f} s"
+        f"{100 * row['strain']:.2f} %, pattern {row['pattern_px']:.2f} px, {row['seconds']:.1f} s"
     )
     if found and found.is_useful:
         text += f"; buckling at {100 * found.critical:.2f} % ({found.interval})"
