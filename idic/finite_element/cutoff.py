@@ -87,7 +87,8 @@ def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> 
     t = float(np.sum(z * found[:, 1:])) / _PROBES
     p = at.sums.pixels
     value = Q / max(1.0 - _DEGREES * excess * t / p, _LEAST_SHARE) ** 2
-    return Risk(cutoff_px, value / p, t, float(np.sqrt(Q / (p - t))))
+    noise = np.sqrt(Q / (p - t)) if Q >= 0.0 and t < p else np.nan  # diverged
+    return Risk(cutoff_px, value / p, t, float(noise))
 
 
 def least_risk(

@@ -269,7 +269,7 @@ class LastStage:
         """Result of the measurement, with standard deviations."""
         (at, here, sd), body, correlation = self._assessed(), self.body, self.correlation
         sd = self._against_law_free(sd)
-        if not (np.isfinite(correlation.u).all() and np.isfinite(sd.by_noise + sd.bias).all()):
+        if not np.isfinite([correlation.u.sum(), (sd.by_noise + sd.bias).sum(), here.noise]).all():
             raise InputError(
                 "expected images that determine a displacement, got no finite one: too much of "
                 "the mesh, or of the mask, shows no speckle that is in both images; check them"

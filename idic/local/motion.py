@@ -51,15 +51,16 @@ class RobustFit:
     """Number of points more than 5 of these off."""
 
 
-def robust_fit(matrix: FloatArray, values: FloatArray) -> RobustFit:
+def robust_fit(matrix: FloatArray, values: FloatArray, least: float = 1e-10) -> RobustFit:
     """Fit linear unknowns so that stray points hardly count (Huber's weights, iterated).
 
-    The matrix (n, c), n > c, times the coefficients should be the values (n,) [mm].
+    The matrix (n, c), n > c, times the coefficients should be the values (n,) [mm]. ``least``:
+    smallest singular value that counts, over the largest.
     """
     weights = np.ones(len(values))
     for _ in range(_ROUNDS):
         root = np.sqrt(weights)
-        fit = np.linalg.lstsq(matrix * root[:, None], values * root, rcond=1e-10)[0]
+        fit = np.linalg.lstsq(matrix * root[:, None], values * root, rcond=least)[0]
         off = np.abs(values - matrix @ fit)
         sd = 1.4826 * float(np.median(off))
         if sd <= 1e-12 * float(np.abs(values).max(initial=1e-300)):
@@ -71,12 +72,14 @@ def robust_fit(matrix: FloatArray, values: FloatArray) -> RobustFit:
 
 
 def fit_unknowns(
-    ansatz: Ansatz, a: ArrayLike, field: LocalField, v0_degree: int, v_degree: int = 0
-) -> RobustFit:
+    ansatz: Ansatz, a: ArrayLike, field: LocalField, v0_degree: int, v_degree: int = 0,
+    least: float = 1e-10,
+) -> RobustFit:  # fmt: skip
     """Fit v0, and every v_i, to displacements at points; the modes are fixed.
 
     ``a`` (size,) gives the modes' parameters; coefficients above the given degrees are set to zero.
-    Raises InputError if there are fewer components than coefficients.
+    ``least`` is as for :func:`robust_fit`. InputError if there are fewer components than
+    coefficients.
     """
     a = ansatz.checked(a).copy()
     stride = max(1, -(-int(field.good.sum()) // MOST_POINTS))
@@ -89,7 +92,7 @@ def fit_unknowns(
     columns = ansatz.sensitivities(a, points[:, None, 0], points[:, None, 1])[..., free]
     a[free] = 0.0
     rest = u - ansatz.displacement_at(a, points)
-    fit = robust_fit(columns.reshape(-1, free.size), rest.ravel())
+    fit = robust_fit(columns.reshape(-1, free.size), rest.ravel(), least)
     a[free] = fit.coefficients
     return RobustFit(a, fit.sd, fit.outliers)
 
@@ -107,13 +110,15 @@ Slow = Callable[[FloatArray], FloatArray]
 """From points (..., 2) to displacements (..., 2) [mm]."""
 
 
-def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tuple[Slow, str]:
+def first_motion(
+    domain: Box, pair: ImagePair, holes: LocalField | None, least: float = 1e-10
+) -> tuple[Slow, str]:
     """Find the slow motion from the images' geometry, and a sentence about it.
 
     From the displacements of the holes' centres, by polynomials over the domain [mm], or from the
-    boundaries in the masks.
+    boundaries in the masks. ``least`` is as for :func:`robust_fit`.
     """
-    found = None if holes is None else _through_holes(domain, holes)
+    found = None if holes is None else _through_holes(domain, holes, least)
     if found is not None:
         return found
     plane = None
@@ -127,7 +132,7 @@ def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tupl
     )
 
 
-def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
+def _through_holes(domain: Box, holes: LocalField, least: float) -> tuple[Slow, str] | None:
     """A polynomial through the holes' displacements; None if there are too few for a plane."""
     count = int(holes.good.sum())
     # At least three points per coefficient.
@@ -136,7 +141,7 @@ def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
         return None
     degree = fitting[-1]
     slow = Ansatz(domain, (), degree, 0)
-    fit = fit_unknowns(slow, np.zeros(slow.size), holes, degree)
+    fit = fit_unknowns(slow, np.zeros(slow.size), holes, degree, least=least)
     return partial(slow.displacement_at, fit.coefficients), (
         f"v0 starts from the motion of {count} hole centres: a polynomial of degree {degree} "
         f"leaves {1e3 * fit.sd:.0f} µm; {fit.outliers} of {2 * count} components are outliers."

@@ -67,6 +67,9 @@ _LOST = 0.1
 _STRAY, _NEIGHBOURS = 8.0, 8
 """Largest difference of a block's motion from its neighbours' median, over their spread; and how
 many neighbours these are."""
+_SLENDER, _DETERMINED = 1.0 / 3.0, 1e-2
+"""Width over length below which a body has axes of its own; least singular value of a polynomial
+through blocks, over the largest: those of blocks that are spread over a body are a tenth."""
 _FIRST = FiniteElementOptions(edge_px=4)
 """Options of the measurement from which only the deformed image's mask is taken."""
 _LAST = FiniteElementOptions(edge_px=1)
@@ -186,8 +189,7 @@ def block_motion(
     match = _matched(pair, mesh, known, BLOCKS)
     require_same_surface(match, *names)
     added = match.in_mm(pair.grid).less(_at_nearest(mesh, known))
-    slow, _ = first_motion(Box(*np.quantile(mesh.nodes, [0, 1], axis=0).T.ravel()), pair, added)
-    known = known + slow(mesh.nodes)
+    known = known + _polynomial(mesh, pair, added)
     for times in _DENSER:
         dense = _matched(pair, mesh, known, times * BLOCKS)
         if dense.found.sum() <= _NEIGHBOURS:  # too few to be compared
@@ -199,6 +201,21 @@ def block_motion(
         spline = RBFInterpolator(left.points[keep], left.u[keep], neighbors=30)
         known = known + spline(mesh.nodes)
     return body.smoothed(known, _SMOOTH_PX * pair.grid.pixel_size)
+
+
+def _polynomial(mesh: Mesh, pair: ImagePair, blocks: LocalField) -> FloatArray:
+    """(n, 2) polynomial through the motion of blocks, at the nodes [mm].
+
+    Blocks of a slender body lie on a line, so its polynomials are those along and across it, and
+    what the blocks don't determine is left out.
+    """
+    _, extents, axes = np.linalg.svd(mesh.nodes - mesh.nodes.mean(axis=0), full_matrices=False)
+    if extents[1] > _SLENDER * extents[0] or blocks.good.sum() < _NEIGHBOURS + 1:
+        axes = np.eye(2)
+    nodes, (x, y), u = mesh.nodes @ axes.T, (blocks.points @ axes.T).T, blocks.u @ axes.T
+    box = Box(*np.quantile(nodes, [0, 1], axis=0).T.ravel())
+    slow, _ = first_motion(box, pair, replace(blocks, x=x, y=y, u=u), _DETERMINED)
+    return np.asarray(slow(nodes) @ axes)
 
 
 def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:

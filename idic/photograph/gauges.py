@@ -40,6 +40,8 @@ class Gauge:
 
     Positions are in the unit of the result, x right and y up from its origin (of ``measure``: the
     middle of the image); with ``pixels`` they are [column, row] as an image viewer shows, from 0.
+    ``angle``: from x to the first axis of a point's or an area's strains, counter-clockwise
+    [degrees]; these are then called 11, 22, 12 instead of xx, yy, xy. None: the picture's axes.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Gauge:
     line: tuple[Position, Position] | None = None
     polygon: tuple[Position, ...] | None = None
     pixels: bool = False
+    angle: float | None = None
 
     def __post_init__(self) -> None:
         names, what = ("point", "line", "polygon"), f"gauge {self.name!r}: expected"
@@ -58,6 +61,10 @@ class Gauge:
             raise InputError(f"{what} one of {', '.join(names)}, got {got}")
         if self.polygon is not None and len(self.polygon) < 3:
             raise InputError(f"{what} 3 corners or more, got {len(self.polygon)}")
+        if self.angle is not None and (self.line is not None or not abs(self.angle) <= 180.0):
+            raise InputError(
+                f"{what} an angle of -180 to 180 degrees, of a point or a polygon, got {self.angle}"
+            )
         if self.line is not None and self.line[0] == self.line[1]:
             raise InputError(f"{what} a line of some length, got none")
 
@@ -109,7 +116,12 @@ def read_at(gauge: Gauge, result: NodalResult, unit: str = "mm") -> Readings:
     InputError if a point or an end is beside the material, or no part of an area is on it.
     """
     points, (u, *du), (F, *dF) = _at(gauge, result)
-    of, names = (_of_line, _LINE) if gauge.line else (_mean, _MEAN)
+    names: tuple[str, ...] = _LINE if gauge.line else _MEAN
+    of = _of_line if gauge.line else _mean
+    if gauge.angle is not None:
+        axes = turned_axes(gauge.angle)
+        F, *dF = (axes @ part @ axes.T for part in (F, *dF))
+        names = tuple(name.translate(_TURNED) if "strain" in name else name for name in names)
     values, units = of(points, u, F), {"u": unit, "v": unit, "length": unit} | _DEGREES
     changes = [of(points, u + v, F + G) - of(points, u - v, F - G)
                for v, G in zip(du, dF, strict=True)]  # fmt: skip
@@ -126,6 +138,7 @@ def along(gauge: Gauge, result: NodalResult) -> FloatArray:
 
 
 _MEAN = ("u", "v", "strain_xx", "strain_yy", "strain_xy", "rotation", "stretch_1", "stretch_2", "J")
+_TURNED = str.maketrans("xy", "12")
 _LINE = ("length", "engineering_strain", "true_strain", "strain_along", "turn")
 
 
@@ -133,6 +146,12 @@ def _mean(points: FloatArray, u: FloatArray, F: FloatArray) -> FloatArray:
     strain = field_of("logarithmic", F).mean(axis=0)
     others = [field_of(name, F).mean() for name in ("rotation", "stretch_1", "stretch_2", "J")]
     return np.array([*u.mean(axis=0), strain[0, 0], strain[1, 1], strain[0, 1], *others])
+
+
+def turned_axes(angle: float) -> FloatArray:
+    """(2, 2) axes as rows, turned counter-clockwise from x and y [degrees]."""
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return np.array([[c, s], [-s, c]])
 
 
 def _of_line(points: FloatArray, u: FloatArray, F: FloatArray) -> FloatArray:

@@ -273,6 +273,9 @@ def measure(
         Path | None,
         typer.Option(metavar="GAUGES.toml", help="Points, lines and areas to read in the fields."),
     ] = None,
+    angle: Annotated[
+        float, typer.Option(help="Of the specimen's axis to x, degrees; strains are along it.")
+    ] = 0.0,
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
@@ -293,7 +296,8 @@ def measure(
         summary = measure_images(
             reference, deformed, out, mask=mask, pixel_size=pixel_size, mesh=mesh,
             brightness=brightness, choice=FrameChoice(every=every),
-            log=None if log is None else LogTable(str(log)), gauges=gauges, progress=progress,
+            log=None if log is None else LogTable(str(log)), gauges=gauges, angle=angle,
+            progress=progress,
         )  # fmt: skip
     print_report(measure_report(summary), out)
 

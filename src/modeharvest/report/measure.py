@@ -57,6 +57,8 @@ def measure_report(
                 _cards(k, names[k], results, residual, picture, summary["unit"]))
         for k in shown
     ] if results and residual and picture else []  # fmt: skip
+    angle = summary.get("angle_deg", 0.0)
+    along = f"the specimen’s axis, {angle:g}° to x" if angle else "x"
     strains, placed = {image["name"]: image["strain_x"] for image in images}, None
     if gauges and results and picture:
         shown_on = results[names[-1]], gauges, picture(names[-1]), summary["unit"]
@@ -73,8 +75,8 @@ def measure_report(
         ],
         sections=[
             *maps,
-            Section.of("timeline", force_cards(images, "strain_x", "mean strain along x")),
-            Section.of("gauges", gauge_cards(summary.get("gauges", ()), strains, placed)),
+            Section.of("timeline", force_cards(images, "strain_x", f"mean strain along {along}")),
+            Section.of("gauges", gauge_cards(summary.get("gauges", ()), strains, placed, along)),
             Section.of("numbers", Card.tabular(table, wide=True)),
         ],
         warnings=[

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull
 
 from modeharvest.fem.field import Mesh, plane_mesh, read_any_mesh, read_mesh, write_mesh
 from modeharvest.idic.chebyshev import Brightness
@@ -51,7 +52,13 @@ from modeharvest.idic.photograph.displacement import (
     speckled,
     uneven_light,
 )
-from modeharvest.idic.photograph.gauges import points_of, read_gauges, reading_rows, write_gauges
+from modeharvest.idic.photograph.gauges import (
+    points_of,
+    read_gauges,
+    reading_rows,
+    turned_axes,
+    write_gauges,
+)
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain, write_shapes
 from modeharvest.idic.photograph.plain.surface import MaterialContours, plain_surface
@@ -88,6 +95,8 @@ from modeharvest.util.typed import picked
 
 _LEAST_PX = 1000
 """Smallest number of pixels that a mesh must cover: about four elements."""
+_RECTANGLE, _TURNED_DEG = 0.97, 1.0
+"""Least share of a rectangle that a specimen with straight sides fills; least angle reported."""
 _OVERLAP = 0.01
 """Largest fraction of a mesh's pixels that may lie in two elements."""
 _MESH_FORMAT = "modeharvest-mesh-1"
@@ -102,8 +111,10 @@ class MeasureCase:
     material by its speckle. ``pixel_size`` [mm]; None for lengths in px. ``mesh``: file of a T3 or
     T6 mesh of the material, readable by meshio; None to mesh the mask. ``brightness``: degree,
     0 to 6, of the polynomials for gain and offset over an image. ``gauges``: a TOML file of
-    gauges for the report. ``sequence``: the files that the names stand for, if these are folders or
-    videos; ``choice``: the command's options for choosing among them.
+    gauges for the report. ``angle``: from x to the specimen's axis, counter-clockwise [degrees]:
+    mean strains, and those of gauges without an angle, are along it. ``sequence``: the files that
+    the names stand for, if these are folders or videos; ``choice``: the command's options for
+    choosing among them.
     """
 
     reference: Path
@@ -115,9 +126,11 @@ class MeasureCase:
     sequence: ChosenFrames | None = None
     choice: tuple[str, ...] = ()
     gauges: Path | None = None
+    angle: float = 0.0
 
     def __post_init__(self) -> None:
         Brightness(self.brightness, self.brightness)  # checks its degree
+        require_within("expected an angle [degrees]", self.angle, -90.0, 90.0)
         if self.pixel_size is not None:
             require_within("expected a pixel size [mm]", self.pixel_size, 1e-9, 1e6)
         named = () if self.sequence else self.files.values()  # files in a folder may be damaged
@@ -325,6 +338,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         with exclusive(self.folder):
             require_writable(self.folder)
             gauges = read_gauges(self.case.gauges) if self.case.gauges else ()
+            if angle := self.case.angle:
+                gauges = tuple(g if g.line or g.angle is not None else replace(g, angle=angle)
+                               for g in gauges)  # fmt: skip
             for gauge in gauges:  # InputError before measuring, if one is beside the material
                 points_of(gauge, self.grid, self.material.mesh)
             results = self.results()
@@ -348,10 +364,11 @@ class MeasureRun(StagedRun[MeasureCase]):
                 word for option, value in (
                     ("--mask", case.mask), ("--pixel-size", case.pixel_size), ("--mesh", case.mesh),
                     ("--brightness", None if case.brightness == 1 else case.brightness),
-                    ("--gauges", case.gauges),
+                    ("--gauges", case.gauges), ("--angle", case.angle or None),
                 ) if value is not None for word in (option, value)
             ), *case.choice, "--out", self.folder),
             "unit": case.unit,
+            "angle_deg": case.angle,
             "pixel_size_mm": case.pixel_size,
             "shape_px": list(self.grid.shape),
             "material_px": int(self.material.mask.sum()),
@@ -359,7 +376,8 @@ class MeasureRun(StagedRun[MeasureCase]):
             else "the whole image, as no background was found" if self.material.mask.all()
             else "found by its speckle" if self.plain is None
             else "found by its grey level",
-            "notes": [*self.reference.notes, *(case.sequence.notes if case.sequence else ())],
+            "notes": [*self.reference.notes, *(case.sequence.notes if case.sequence else ()),
+                      *(() if case.angle else turned_sides(self.material.mask))],
             "warnings": [*self.reference.warnings, *self.material.changes],
             "skipped": [
                 {"name": name, "reason": reason} for name, reason in (
@@ -377,7 +395,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "name": name,
             "file": str(self.case.files[name]),
             **recorded_with(self.case.sequence, name),
-            **_mean_motion(result),
+            **_mean_motion(result, self.case.angle),
             "rms_px": float(np.sqrt(np.mean(inside**2))),
             "max_px": float(np.linalg.norm(inside, axis=-1).max()),
             "median_sd_px": float(np.median(result.standard_deviation)) / px,
@@ -409,9 +427,30 @@ class MeasureRun(StagedRun[MeasureCase]):
         }
 
 
-def _mean_motion(result: NodalResult) -> dict[str, float]:
-    """Mean strain along the material's x and y [-], tension positive, and rotation [degrees].
+def turned_sides(mask: BoolArray) -> tuple[str, ...]:
+    """Text if a mask (rows, cols) is a rectangle, but for holes, whose sides are turned."""
+    row, col = np.nonzero(np.diff(mask, axis=1, prepend=False, append=False))
+    corners = np.concatenate([np.column_stack([col, half - row]) for half in (-0.5, 0.5)])
+    hull = ConvexHull(corners)
+    corners = corners[hull.vertices]
+    sides = np.roll(corners, -1, axis=0) - corners
+    angles = (np.degrees(np.arctan2(sides[:, 1], sides[:, 0])) + 45.0) % 90.0 - 45.0
+    turned = (turned_axes(angle) @ corners.T for angle in angles)
+    areas = [float(np.prod(np.ptp(points, axis=1))) for points in turned]
+    best = int(np.argmin(areas))  # of the smallest rectangle around the material
+    angle = float(angles[best])
+    if hull.volume < _RECTANGLE * areas[best] or abs(angle) < _TURNED_DEG:
+        return ()
+    return (
+        f"The specimen's sides are turned by {angle:.1f}° from the picture's axes: mean strains, "
+        f"and those of gauges, are along its own axes with --angle {angle:.1f}.",
+    )
 
+
+def _mean_motion(result: NodalResult, angle: float = 0.0) -> dict[str, float]:
+    """Mean strain along x and y [-], tension positive, and rotation [degrees].
+
+    ``angle``: from the picture's x to this one, counter-clockwise [degrees].
     They are those of the affine motion that fits the nodal displacements; rotation gives no strain.
     Parts of the material that don't hang together may move apart, which gives none either.
     """
@@ -423,7 +462,7 @@ def _mean_motion(result: NodalResult) -> dict[str, float]:
         for values in (result.mesh.nodes, result.displacement)
     )
     F = np.eye(2) + np.linalg.lstsq(columns, motion, rcond=None)[0].T
-    along, up = np.linalg.norm(F, axis=0) - 1.0
+    along, up = np.linalg.norm(turned_axes(angle) @ F @ turned_axes(angle).T, axis=0) - 1.0
     turned = np.degrees(np.arctan2(F[1, 0] - F[0, 1], F[0, 0] + F[1, 1]))
     return {"strain_x": float(along), "strain_y": float(up), "rotation_deg": float(turned)}
 
@@ -432,12 +471,13 @@ def measure(
     reference: Path | str, deformed: Sequence[Path | str], folder: Path | str, *,
     mask: Path | str | None = None, pixel_size: float | None = None, mesh: Path | str | None = None,
     brightness: int = 1, choice: FrameChoice | None = None, log: LogTable | None = None,
-    gauges: Path | str | None = None, progress: Progress = silent,
+    gauges: Path | str | None = None, angle: float = 0.0, progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
 
     ``deformed`` may also be folders and videos; ``choice``: which of their frames are measured;
-    ``log``: log of the testing machine; ``gauges``: a TOML file of gauges for the report.
+    ``log``: log of the testing machine; ``gauges``: a TOML file of gauges for the report;
+    ``angle``: of the specimen's axis, along which mean strains and gauges read.
 
     Writes its files to ``folder`` and returns the content of ``summary.json``. Raises InputError if
     an image, the mask or the mesh can't be used.
@@ -451,6 +491,6 @@ def measure(
     case = MeasureCase(
         sequence.reference, names, None if mask is None else Path(mask),
         pixel_size, None if mesh is None else Path(mesh), brightness, sequence,
-        tuple(flags), None if gauges is None else Path(gauges),
+        tuple(flags), None if gauges is None else Path(gauges), angle,
     )  # fmt: skip
     return MeasureRun(case, Path(folder), progress).all()

@@ -108,10 +108,11 @@ def _pixels(draw: Draw) -> NDArray[np.uint8]:
         return np.pad(pixels, [*more, (0, 0)], constant_values=255)
 
 
-def draw_gauge(name: str, readings: Sequence[Readings], strain: FloatArray | None = None) -> Figure:
+def draw_gauge(name: str, readings: Sequence[Readings], strain: FloatArray | None = None,
+               along: str = "x") -> Figure:  # fmt: skip
     """Draw the strains read by a gauge in each image, with 95 % intervals.
 
-    The abscissa is the image's number, or if given, ``strain`` (n,) along x of each image [-].
+    The abscissa is the image's number, or if given, ``strain`` (n,) of each image [-].
     """
     drawn = style.figure(3.6, 2.4)
     axes = drawn.add_axes((0.22, 0.19, 0.75, 0.69))
@@ -121,7 +122,7 @@ def draw_gauge(name: str, readings: Sequence[Readings], strain: FloatArray | Non
         value, sd = np.array([r[what][:2] for r in readings], dtype=np.float64).T
         axes.errorbar(at, value, 1.96 * np.nan_to_num(sd), color=style.colour(k), marker="o",
                       ms=3, capsize=2, lw=1.2, label=what.replace("_", " "))  # fmt: skip
-    axes.set(xlabel="mean strain along x [%]", ylabel="strain [-]")
+    axes.set(xlabel=f"mean strain along {along} [%]", ylabel="strain [-]")
     if strain is None:
         axes.set(xlabel="image", xticks=number[:: 1 + len(number) // 10])
     axes.set_title(name, fontsize=8.5, loc="left")
@@ -151,12 +152,13 @@ def draw_gauges_on(
 
 
 def gauge_cards(
-    rows: Sequence[Mapping[str, Any]], strains: Mapping[str, float], placed: Draw | None
-) -> list[Card]:
+    rows: Sequence[Mapping[str, Any]], strains: Mapping[str, float], placed: Draw | None,
+    along: str = "x",
+) -> list[Card]:  # fmt: skip
     """Make cards of the gauges on the last photograph, their strains, and the last readings.
 
-    ``rows``: readings in ``summary.json``; ``strains``: mean strain along x [-] by image name, in
-    the order of the test; ``placed``: draws the gauges, None for no figure of them.
+    ``rows``: readings in ``summary.json``; ``strains``: mean strain [-] ``along`` an axis by image
+    name, in the order of the test; ``placed``: draws the gauges, None for no figure of them.
     """
     if not rows:
         return []
@@ -168,7 +170,7 @@ def gauge_cards(
              for row in rows if row["gauge"] == gauge and row["image"] == image}
             for image in strains
         ]  # fmt: skip
-        drawn = partial(draw_gauge, gauge, own, np.array([*strains.values()]))
+        drawn = partial(draw_gauge, gauge, own, np.array([*strains.values()]), along)
         figure = ReportFigure(f"gauge-{k + 1}", "", drawn)
         cards.append(Card(**caption("gauge", gauge=gauge), figures=[figure]))
     table = [
