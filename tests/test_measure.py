@@ -34,7 +34,12 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.field import read_field
-from modeharvest.idic.photograph.displacement import block_motion, displacement_from, uneven_light
+from modeharvest.idic.photograph.displacement import (
+    block_motion,
+    deformed_mask,
+    displacement_from,
+    uneven_light,
+)
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import write_image
@@ -593,3 +598,19 @@ def test_bad_input_is_one_line(
     command = ["measure", plate.folder / "ref.tif", deformed, *options, "--out", tmp_path / "out"]
     assert called(monkeypatch, *command) == 2
     assert message in error_line(capsys)
+
+
+def test_a_folded_element_takes_no_other_s_material_from_the_deformed_image() -> None:
+    """One in a place that a reflection hid cost the whole mask, and edges drifted off by 34 px."""
+    grid = PixelGrid.centred(160, 200, 1.0)
+    mask = np.zeros(grid.shape, np.bool_)
+    mask[20:-20, 20:-20] = True
+    mesh = FiniteElementOptions(12.0, 12.0).body(mask, grid).mesh
+    u = np.zeros_like(mesh.nodes)
+    u[np.argmin(np.linalg.norm(mesh.nodes, axis=1))] = [30.0, 0.0]
+    found, at_rest = (deformed_mask(grid, mesh, motion, 2.0) for motion in (u, 0.0 * u))
+    assert found is not None
+    assert at_rest is not None
+    far = np.hypot(*np.meshgrid(grid.x, grid.y)) > 30.0
+    np.testing.assert_array_equal(found[far], at_rest[far])
+    assert deformed_mask(grid, mesh, -2.0 * mesh.nodes[:, ::-1], 2.0) is None

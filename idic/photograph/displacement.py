@@ -39,6 +39,7 @@ from modeharvest.idic.photograph.matching.blocks import (
 from modeharvest.idic.solver.noise import estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import smoothed
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.bernstein import non_positive_jacobians
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
@@ -247,14 +248,12 @@ def _at_nearest(mesh: Mesh, u: FloatArray) -> Slow:
 def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) -> BoolArray | None:
     """(rows, cols) True where the deformed image shows a mesh, less a margin; None if nowhere.
 
-    ``u`` (n, 2): displacement of the nodes [mm]. None, too, if it folds an element.
+    ``u`` (n, 2): displacement of the nodes [mm]. Elements that it folds are left out.
     """
-    try:
-        moved = locate(mesh.nodes + u, mesh.cells, mesh.element, grid).mask
-    except InputError:
-        return None
-    inner = shrunk(moved, less_px)
-    return inner if inner.any() else None
+    moved = mesh.nodes + u
+    cells = np.delete(mesh.cells, non_positive_jacobians(moved, mesh.cells, mesh.element), axis=0)
+    inner = shrunk(locate(moved, cells, mesh.element, grid).mask, less_px) if cells.size else None
+    return inner if inner is not None and inner.any() else None
 
 
 def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
