@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shlex
 from functools import cache
 from pathlib import Path
@@ -353,7 +354,11 @@ def test_what_does_not_match_is_reported(plate: Plate, tmp_path: Path) -> None:
     write_image(tmp_path / "patched.tif", image)
     summary = measure(plate.folder / "ref.tif", [tmp_path / "patched.tif"], tmp_path / "out",
                       mask=plate.folder / "mask.tif")  # fmt: skip
-    assert "the images don't match" in summary["images"][0]["warnings"][-1]
+    warning = summary["images"][0]["warnings"][-1]
+    assert "the surface has changed" in warning
+    row, col = map(int, re.findall(r"row (\d+), column (\d+)", warning)[0])
+    assert 120 <= row < 150
+    assert 180 <= col < 220
 
 
 @pytest.mark.parametrize("degree", [0, 1])

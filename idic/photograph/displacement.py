@@ -116,6 +116,12 @@ def displacement_from(
 
     def seen(u: FloatArray, off_px: float, degree: int) -> ImagePair:
         """The images, equally bright, without what shows background if edges are off this much."""
+        folded = np.zeros(len(mesh.cells), np.bool_)
+        folded[non_positive_jacobians(mesh.nodes + u, mesh.cells, mesh.element)] = True
+        if folded.any():  # where they are is known from around
+            known = body.away_from(folded)
+            around = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
+            u = np.where(known[:, None], u, around)
         pair_alike = alike(pair, mesh, u, degree)
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(pair_alike, deformed_mask=mask)
