@@ -270,7 +270,7 @@ def row(make: Callable[[Path], Images], folder: Path, brightness: int = 1) -> st
         [f"{last['cutoff_px']:.0f}", f"{rms(there):.3f}"]
         + [f"{np.quantile(length, q):.2f}" for q in (0.95, 0.999, 1.0)]
         + [f"{100 * np.mean((np.abs(error) < 1.96 * sd)[np.isfinite(error)]):.0f} %"]
-        + [f"{100 * len(there) / len(error):.1f} %", f"{took:.0f}"]
+        + [f"{100 * last['coverage']:.1f} %", f"{took:.0f}"]
     )
 
 

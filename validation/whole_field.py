@@ -95,7 +95,7 @@ def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> Who
         w_rms_px=rms(w) / px, w_max_px=float(lengths(w).max()) / px, start=whole.start,
         rms_beyond_refit_px=rms(u[there] - by_refit) / px,
         rms_refit_to_idic_px=rms(by_refit - by_idic) / px,
-        sd_px=rms(measured.standard_deviation) / px, coverage=float(there.sum() / mask.sum()),
+        sd_px=rms(measured.standard_deviation) / px, coverage=measured.coverage(there, mask),
         modes=tuple(_both_ways(refit, correlated, i) for i in range(len(refit.ansatz.modes))),
         **picked(measured, "cutoff_px unknowns residual_rms noise_power library warnings"),
     )  # fmt: skip
@@ -155,7 +155,7 @@ def compare_whole(
         rms_px=rms(error[there]) / px, rms_edges_px=by_region.get(EDGES),
         rms_ligaments_px=by_region.get(LIGAMENTS), rms_junctions_px=by_region.get(JUNCTIONS),
         rms_bulk_px=by_region.get(BULK), max_px=float(lengths(error[there]).max()) / px,
-        coverage=float(there.sum() / mask.sum()),
+        coverage=measured.coverage(there, mask),
         rms_refit_to_best_fit_px=rms((refit.displacement() - best.displacement())[mask]) / px,
         interval_coverage=float(inside[there].mean()),
         interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in by_region else None,

@@ -92,14 +92,15 @@ class MeshCorrelation:
         pair = pair.without_extremes()
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = spline_order(self.speckle_px)
-        blank, hidden = (
-            grown(flat(image, mask, self.speckle_px), BESIDE_PX)
+        self.blank: tuple[BoolArray, ...] = tuple(
+            grown(flat(image, mask, self.speckle_px), BESIDE_PX) & mask
             for image, mask in zip((pair.reference, pair.deformed), pair.masks, strict=True)
         )
-        self.hidden = self.blank = blank & pair.masks[0]
-        """(rows, cols) True for pixels that don't count; for those of them without speckle."""
-        if hidden.any() and (pair.deformed_mask is not None or pair.masks[0].all()):
-            pair = replace(pair, deformed_mask=pair.masks[1] & ~hidden)
+        """(rows, cols) True for pixels of each image without speckle."""
+        self.hidden = self.blank[0]
+        """(rows, cols) True for pixels of the reference that don't count."""
+        if self.blank[1].any() and (pair.deformed_mask is not None or pair.masks[0].all()):
+            pair = replace(pair, deformed_mask=pair.masks[1] & ~self.blank[1])
         self.pair, self.body, self.start = pair, body, start
         self.edge_px, self.steps = edge_px, steps
         self.prior: Smoothness | Imbalance = Smoothness(body, start)
@@ -209,12 +210,16 @@ class MeshCorrelation:
         """Use another regularisation, from the present displacement or from (2 n,) u [mm]."""
         self.prior, self.u, self._kept = prior, self.u if u is None else u, None
 
-    def residual(self, some: ElementPixels) -> FloatArray:
-        """(rows, cols) f - g(x + u) of some of the unfiltered pixels, else NaN [grey levels]."""
+    def moved(self, some: ElementPixels) -> tuple[FloatArray, FloatArray]:
+        """Rows and columns (p,) to which u takes some of the unfiltered pixels [px]."""
         N, cells = shape_functions("T6", some.xi.T), self.body.mesh.cells
         nodal = self.u.reshape(-1, 2)[np.repeat(cells, np.diff(some.start), axis=0)]
         right, up = np.einsum("pk,pki->ip", N, nodal) / self.pair.grid.pixel_size
-        g, _, _ = self.on(FULL).images.deformed.sample(some.row - up, some.col + right)
+        return some.row - up, some.col + right
+
+    def residual(self, some: ElementPixels) -> FloatArray:
+        """(rows, cols) f - g(x + u) of some of the unfiltered pixels, else NaN [grey levels]."""
+        g, _, _ = self.on(FULL).images.deformed.sample(*self.moved(some))
         residual = np.full(self.pair.grid.shape, np.nan)
         residual[some.row, some.col] = some.grey - g
         return residual

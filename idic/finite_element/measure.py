@@ -33,6 +33,7 @@ from modeharvest.idic.finite_element.mismatch import (
     matched,
     mismatches,
     noise_power,
+    not_compared,
 )
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
@@ -268,7 +269,7 @@ class LastStage:
     def result(self) -> NodalResult:
         """Result of the measurement, with standard deviations."""
         (at, here, sd), body, correlation = self._assessed(), self.body, self.correlation
-        sd = self._against_law_free(sd)
+        sd, lost = self._against_law_free(sd), not_compared(correlation)
         if not np.isfinite([correlation.u.sum(), (sd.by_noise + sd.bias).sum(), here.noise]).all():
             raise InputError(
                 "expected images that determine a displacement, got no finite one: too much of "
@@ -286,7 +287,8 @@ class LastStage:
             residual_noise=here.noise,
             effective_unknowns=here.unknowns,
             library=body.library,
-            warnings=(*self.warnings, *mismatches(correlation, at)),
+            warnings=(*self.warnings, *mismatches(correlation, at, lost)),
+            not_compared=int(np.sum(lost)),
             **picked(self, "cutoff_px tried contradicted"),
             **picked(correlation, "start noise_power"),
             **picked(at.sums, "pixels outside"),

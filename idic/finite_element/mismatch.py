@@ -7,6 +7,8 @@ What the noise of the matching pixels has in common with its neighbours is found
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.ndimage import label
 
@@ -33,8 +35,8 @@ _DIFFERS, _MOST_HIDDEN = 0.5, 0.8
 deviation; they count nevertheless if they are a larger share of the material."""
 _SAMPLED = 200_000
 """Pixels from which the correlation of noise is estimated."""
-_BLANK = 0.01
-"""Share of the material without speckle above which a warning is given [-]."""
+_WITHOUT = 0.01
+"""Share of the material in elements without speckle above which a warning is given [-]."""
 _GUESS = (
     "there the displacement is the smoothest that fits around, and its standard deviation a guess."
 )
@@ -109,31 +111,60 @@ def matched(correlation: MeshCorrelation) -> BoolArray:
     return np.asarray(body.away_from(is_off, _AROUND) & body.away_from(~is_seen))
 
 
-def mismatches(correlation: MeshCorrelation, at: Linearised) -> tuple[str, ...]:
+class NotCompared(NamedTuple):
+    """Pixels of the material that don't count in the end, (rows, cols) each, by the reason."""
+
+    blank: BoolArray
+    changed: BoolArray
+    gone: BoolArray
+    """They have no speckle in an image, their surface has changed, or has left the picture."""
+
+
+def not_compared(correlation: MeshCorrelation) -> NotCompared:
+    """The pixels of the material that don't count at the present displacement."""
+    pixels, (in_f, in_g) = correlation.on(FULL).pixels, correlation.blank
+    row, col = (np.rint(at).astype(int) for at in correlation.moved(pixels))
+    stays = (row >= 0) & (row < in_g.shape[0]) & (col >= 0) & (col < in_g.shape[1])
+    blank, gone = in_f.copy(), np.zeros_like(in_f)
+    gone[pixels.row[~stays], pixels.col[~stays]] = True
+    blank[pixels.row[stays], pixels.col[stays]] = in_g[row[stays], col[stays]]
+    return NotCompared(blank, correlation.hidden & ~in_f, gone)
+
+
+def mismatches(
+    correlation: MeshCorrelation, at: Linearised, lost: NotCompared
+) -> tuple[str, ...]:
     """Warnings of places without speckle, of changed surfaces, and of images that don't match."""
     found, counts = [], np.diff(correlation.on(FULL).pixels.start)
-    total = counts.sum() + correlation.hidden.sum()
-    blank = float((counts[at.signal == 0.0].sum() + correlation.blank.sum()) / total)
-    if blank > _BLANK:
+    total, mesh = counts.sum() + correlation.hidden.sum(), correlation.body.mesh
+    for pixels, what in (
+        (lost.blank, "an image has one grey level, as reflections have"),
+        (lost.changed, "the surface has changed, or is hidden"),
+    ):
+        if pixels.any():
+            share = 100.0 * pixels.sum() / total
+            found.append(f"{_place(pixels)} {what} (on {share:.2g} % of the material): {_GUESS}")
+    without = float(counts[at.signal == 0.0].sum() / total)
+    if without > _WITHOUT:
         found.append(
-            f"{100 * blank:.0f} % of the material shows no speckle that is in both images: {_GUESS}"
-        )
-    if (changed := correlation.hidden & ~correlation.blank).any():
-        places, count = label(changed)
-        largest = np.argwhere(places == 1 + np.bincount(places.ravel())[1:].argmax())
-        (row, col), share = largest.mean(axis=0), 100.0 * changed.sum() / total
-        others = f" and in {count - 1} smaller place{'s' * (count > 2)}" if count > 1 else ""
-        found.append(
-            f"Around row {row:.0f}, column {col:.0f}{others} the surface has changed, or is hidden "
-            f"(on {share:.2g} % of the material): {_GUESS}"
+            f"{100 * without:.0f} % of the material shows no speckle that is in both images: "
+            f"{_GUESS}"
         )
     if counts[off := unlike(correlation, at)].sum() > _SOME_PIXELS:
-        mesh, grid = correlation.body.mesh, correlation.pair.grid
         worst = np.argmax(at.sums.squares / np.maximum(at.sums.weights, 1.0))
-        row, col = grid.to_px(*mesh.nodes[mesh.cells[worst]].mean(axis=0))
+        row, col = correlation.pair.grid.to_px(*mesh.nodes[mesh.cells[worst]].mean(axis=0))
         found.append(
             f"Around row {row:.0f}, column {col:.0f} the images don't match (on "
             f"{100 * counts[off].sum() / counts.sum():.2g} % of the material): there the "
             "surface has changed, or the displacement is wrong."
         )
     return tuple(found)
+
+
+def _place(pixels: BoolArray) -> str:
+    """Where the largest connected part of some pixels (rows, cols) is, and how many others."""
+    parts, count = label(pixels)
+    largest = np.argwhere(parts == 1 + np.bincount(parts.ravel())[1:].argmax())
+    (row, col), others = largest.mean(axis=0), f" and in {count - 1} smaller place"
+    text = f"Around row {row:.0f}, column {col:.0f}"
+    return text if count == 1 else text + others + "s" * (count > 2)

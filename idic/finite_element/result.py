@@ -71,6 +71,9 @@ class NodalResult:
     """Warnings, one sentence each."""
     contradicted: float | None = None
     """Share of nodes on free edges where a law changes u significantly [-]; None without a law."""
+    not_compared: int = 0
+    """Number of pixels of the material that don't count: without speckle in an image, with a
+    surface that has changed, or out of the picture."""
     noise_power: float = 1.0
     """Power of the images' noise at long waves, over its variance [-]: 1 for white noise."""
     shown: str = "speckle"  # or "contours", for which residuals are distances [px]
@@ -106,6 +109,10 @@ class NodalResult:
     def displacement_on(self, grid: PixelGrid | None = None) -> FloatArray:
         """(rows, cols, 2) u at pixels [mm]."""
         return self.on_pixels(self.displacement, grid)
+
+    def coverage(self, known: BoolArray, mask: BoolArray) -> float:
+        """Share of a mask's material (rows, cols) that is measured; ``known``: where u is [-]."""
+        return max(0, int((mask & known).sum()) - self.not_compared) / max(1, int(mask.sum()))
 
     def standard_deviation_on(self, grid: PixelGrid | None = None) -> FloatArray:
         """(rows, cols, 2) standard deviation of u at pixels [mm]."""

@@ -390,7 +390,8 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _image(self, name: str, result: NodalResult) -> dict[str, Any]:
         px, mask = self.grid.pixel_size, self.material.mask
         u = result.displacement_on()
-        inside = u[mask & np.isfinite(u).all(axis=-1)] / px
+        known = np.isfinite(u).all(axis=-1)
+        inside = u[mask & known] / px
         numbers = {
             "name": name,
             "file": str(self.case.files[name]),
@@ -399,7 +400,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "rms_px": float(np.sqrt(np.mean(inside**2))),
             "max_px": float(np.linalg.norm(inside, axis=-1).max()),
             "median_sd_px": float(np.median(result.standard_deviation)) / px,
-            "coverage": len(inside) / int(mask.sum()),
+            "coverage": result.coverage(known, mask),
             **picked(result, "shown unknowns effective_unknowns pixels"),
             **picked(result, "residual_rms residual_noise noise_power library"),
             "warnings": list(result.warnings),
