@@ -111,6 +111,17 @@ def reflecting(images: Images, rows: slice, cols: slice) -> Images:
     return images
 
 
+def dusty(images: Images, count: int = 40) -> Images:
+    """The same images with dark specks, 4 to 8 px wide and elsewhere in each of them."""
+    random, shown = np.random.default_rng(0), [image.copy() for image in images[0]]
+    for image in shown:
+        row, col = (random.uniform(0, n, count) for n in image.shape)
+        y, x = np.indices(image.shape)
+        for n, radius in enumerate(random.uniform(2.0, 4.0, count)):
+            image[np.hypot(y - row[n], x - col[n]) < radius] = 0.1
+    return shown, *images[1:]
+
+
 Camera = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 """Photographs a surface (rows, cols) [0 ... 1], with noise of some standard deviation."""
 
@@ -193,6 +204,9 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "12.8 %, noise of 1 %, a reflection": lambda folder: reflecting(
         photographed(specimen(folder), white, 0.01), slice(400, 460), slice(300, 380)
     ),
+    "12.8 %, noise of 1 %, dust": lambda folder: photographed(
+        dusty(specimen(folder)), white, 0.01
+    ),
     "12.8 %, speckle of 6 px": lambda folder: specimen(folder, size=0.5),
     "12.8 %, speckle of 4 px": lambda folder: specimen(folder, size=0.33),
     "12.8 %, 0.01 mm/px, 4 px": lambda folder: specimen(folder, size=0.33, pixel_size=0.01),
@@ -213,6 +227,9 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "shift by 0.6 px, noise of 1 %": lambda folder: rigid(folder, (0.37, -0.41), 0.0, 0.01),
     "turn by 10°, noise of 1 %": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01),
     "the same, speckle of 12 px": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01, 2.5),
+    "turn by 10°, noise of 1 %, dust": lambda folder: photographed(
+        dusty(rigid(folder, (5.3, -8.6), 10.0)), white, 0.01
+    ),
     "turn by 10°, noise of 1 %, correlated": lambda folder: rigid(
         folder, (5.3, -8.6), 10.0, 0.01, camera=smoothing
     ),

@@ -26,9 +26,11 @@ from modeharvest.idic.finite_element.measure import (
 from modeharvest.idic.finite_element.result import NodalResult, refitted
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.result import Result
+from modeharvest.idic.photograph.displacement import displacement_from
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
+from modeharvest.validation.truth import rms
 
 pytest.importorskip("gmsh")
 
@@ -354,6 +356,41 @@ def test_the_largest_of_two_changed_places_is_named() -> None:
     row, col = map(int, re.findall(r"row (\d+), column (\d+)", warning)[0])
     assert np.linalg.norm(at[row, col] - [0.8, -0.4]) < 0.1
     assert "smaller place" in warning
+
+
+def test_a_small_place_of_one_grey_level_is_named_and_does_not_count() -> None:
+    """Nothing was said of it, and all of it passed for measured."""
+    pair, at = plate_pair(wavy_field), np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
+    near = (np.abs(at - [0.8, -0.4]) < 0.1).all(axis=-1)
+    shown = pair.with_images(np.where(near, 0.9, pair.reference), pair.deformed)
+    found = measure_displacement(shown, at_rest, options=COARSE)
+    (warning,) = found.warnings
+    assert "one grey level" in warning
+    row, col = map(int, re.findall(r"row (\d+), column (\d+)", warning)[0])
+    assert np.linalg.norm(at[row, col] - [0.8, -0.4]) < 0.02
+    count = pair.masks[0].sum()
+    assert near.sum() <= found.not_compared < 2.5 * near.sum()
+    known = np.isfinite(found.displacement_on()).all(axis=-1)
+    assert found.coverage(known, pair.masks[0]) == pytest.approx(1 - found.not_compared / count)
+
+
+def test_dust_spoils_nothing() -> None:
+    """Specks of few pixels made the cut-off wavelength as short as it can be: 0.8 px rms."""
+    pair, random = plate_pair(quadratic_field), np.random.default_rng(0)
+    row, col = np.indices(GRID.shape)
+    images = []
+    for image in (pair.reference, pair.deformed):
+        near = np.zeros(GRID.shape, np.bool_)
+        for centre in random.uniform(0, GRID.shape, (30, 2)):
+            near |= np.hypot(row - centre[0], col - centre[1]) < 1.8
+        noise = 0.02 * random.standard_normal(GRID.shape)
+        images.append(np.where(near, image.min(), image) + noise)
+    body = COARSE.body(pair.masks[0], GRID)
+    start = quadratic_field(body.mesh.nodes)
+    found = displacement_from(start, pair.with_images(*images), body, COARSE)
+    (warning,) = found.warnings
+    assert "the surface has changed, or is hidden" in warning
+    assert rms(error_px(pair, found)) < 0.2
 
 
 @pytest.mark.parametrize("shift", [(2, 0), (4, 4), (-3, 2), (0, -6)])

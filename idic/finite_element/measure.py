@@ -30,6 +30,7 @@ from modeharvest.idic.finite_element.equations.system import Body, Imbalance, Li
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.mismatch import (
     again_where_unlike,
+    leave_out_specks,
     matched,
     mismatches,
     noise_power,
@@ -131,6 +132,7 @@ def measure_displacement(
     for stage in counted((*COARSE, None), progress, "whole displacement"):
         if stage is None:
             again_where_unlike(correlation, *COARSE)
+            leave_out_specks(correlation, *COARSE)
             last.regularise()
         else:
             correlation.through(stage)

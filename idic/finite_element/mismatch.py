@@ -11,13 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import label
+from scipy.stats import median_abs_deviation
 
 from modeharvest.idic.finite_element.correlation import BESIDE_PX, MeshCorrelation, Stage
+from modeharvest.idic.finite_element.equations.pixels import ElementPixels
 from modeharvest.idic.finite_element.equations.system import Linearised
 from modeharvest.idic.solver.noise import power_of_long_waves
 from modeharvest.idic.solver.pyramid import FULL
 from modeharvest.util.arrays import BoolArray
-from modeharvest.util.masks import grown
+from modeharvest.util.masks import grown, large_parts
 
 _UNLIKE = 0.25
 """Images don't match in an element whose mean square residual less noise, over the reference's
@@ -33,8 +35,12 @@ _AROUND = 2
 _DIFFERS, _MOST_HIDDEN = 0.5, 0.8
 """Pixels differ if their residual, beyond noise, is larger than this, over the speckle's standard
 deviation; they count nevertheless if they are a larger share of the material."""
+_SPECK, _OF_SPECKLE, _ROUNDS = 6, 0.25, 3
+"""So many connected pixels that differ don't count, either, and a square of this share of a speckle
+at least; largest number of searches. Residuals of displacements that aren't resolved exceed the
+limit in up to 5 connected pixels of speckle of 4 px."""
 _SAMPLED = 200_000
-"""Pixels from which the correlation of noise is estimated."""
+"""Pixels from which noise is estimated."""
 _WITHOUT = 0.01
 """Share of the material in elements without speckle above which a warning is given [-]."""
 _GUESS = (
@@ -70,34 +76,62 @@ def again_where_unlike(correlation: MeshCorrelation, *stages: Stage) -> None:
         correlation.start = start
 
 
+def leave_out_specks(correlation: MeshCorrelation, *stages: Stage) -> None:
+    """Measure without places that differ, too small for an element not to match: such as dust.
+
+    The cut-off wavelength is found from the residual of all pixels.
+    """
+    least = max(_SPECK, (_OF_SPECKLE * correlation.speckle_px) ** 2)
+    for _ in range(_ROUNDS):
+        residual = np.nan_to_num(correlation.residual(correlation.on(FULL).pixels))
+        specks = large_parts(np.abs(residual) > _limit(correlation), least)
+        if not specks.any():
+            break
+        correlation.without(correlation.hidden | grown(specks, BESIDE_PX))
+        for stage in stages:
+            correlation.through(stage)
+
+
+def _limit(correlation: MeshCorrelation) -> float:
+    """Residual beyond which pixels differ [grey levels]; its median shows noise of any kind."""
+    pixels = correlation.on(FULL).pixels
+    residual = correlation.residual(_some(pixels))
+    noise = median_abs_deviation(residual, axis=None, scale="normal", nan_policy="omit")
+    return _DIFFERS * float(pixels.grey.std()) + _BY_CHANCE * float(noise)
+
+
+def _some(pixels: ElementPixels, use: BoolArray | bool = True) -> ElementPixels:
+    """Pixels of middle rows, of those to use (p,), from which noise is estimated."""
+    share = min(1.0, _SAMPLED / pixels.row.size)
+    low, high = np.quantile(pixels.row, [0.5 - 0.5 * share, 0.5 + 0.5 * share])
+    return pixels.only((pixels.row >= low) & (pixels.row <= high) & use)
+
+
 def _hide(correlation: MeshCorrelation, cells: BoolArray, *stages: Stage) -> None:
     """Measure without the pixels of elements (m,), then with those of them that match."""
     on, full = correlation.on(FULL), [stage for stage in stages if stage.level == FULL]
-    around, before = on.pixels.only(np.repeat(cells, np.diff(on.pixels.start))), correlation.hidden
-    if around.row.size > _MOST_HIDDEN * on.pixels.row.size:
+    there, before = on.pixels.only(np.repeat(cells, np.diff(on.pixels.start))), correlation.hidden
+    if there.row.size > _MOST_HIDDEN * on.pixels.row.size:
         return
-    differ: BoolArray = np.ones(around.row.size, np.bool_)
-    limit = _DIFFERS * float(on.pixels.grey.std()) + _BY_CHANCE * np.sqrt(sum(correlation.noise))
+    differ: BoolArray = np.ones(there.row.size, np.bool_)
+    limit = _limit(correlation)
     for then in (stages, full, full):  # blurred images mix them with what is around
         hidden = np.zeros_like(before)
-        hidden[around.row[differ], around.col[differ]] = True
+        hidden[there.row[differ], there.col[differ]] = True
         correlation.without(before | grown(hidden, BESIDE_PX))
         known = correlation.body.away_from(np.diff(correlation.on(FULL).pixels.start) == 0)
         correlation.start = correlation.from_around(correlation.u.reshape(-1, 2), known)
         correlation.restart(correlation.start, known)
         for stage in then:
             correlation.through(stage)
-        residual = correlation.residual(around)[around.row, around.col]
-        differ = around.completed(~(np.abs(residual) <= limit))
+        residual = correlation.residual(there)[there.row, there.col]
+        differ = there.completed(~(np.abs(residual) <= limit))
 
 
 def noise_power(correlation: MeshCorrelation) -> float:
     """Power of the noise at long waves over its variance, from middle rows of the residual."""
     pixels = correlation.on(FULL).pixels
-    share = min(1.0, _SAMPLED / pixels.row.size)
-    low, high = np.quantile(pixels.row, [0.5 - 0.5 * share, 0.5 + 0.5 * share])
-    alike = np.repeat(~unlike(correlation), np.diff(pixels.start))
-    some = pixels.only((pixels.row >= low) & (pixels.row <= high) & alike)
+    some = _some(pixels, np.repeat(~unlike(correlation), np.diff(pixels.start)))
     residual = correlation.residual(some)
     contrast = float(some.grey.std()) if some.grey.size else 0.0
     return power_of_long_waves(np.nan_to_num(residual), np.isfinite(residual), contrast)
