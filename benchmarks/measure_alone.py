@@ -204,9 +204,7 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "12.8 %, noise of 1 %, a reflection": lambda folder: reflecting(
         photographed(specimen(folder), white, 0.01), slice(400, 460), slice(300, 380)
     ),
-    "12.8 %, noise of 1 %, dust": lambda folder: photographed(
-        dusty(specimen(folder)), white, 0.01
-    ),
+    "12.8 %, noise of 1 %, dust": lambda folder: photographed(dusty(specimen(folder)), white, 0.01),
     "12.8 %, speckle of 6 px": lambda folder: specimen(folder, size=0.5),
     "12.8 %, speckle of 4 px": lambda folder: specimen(folder, size=0.33),
     "12.8 %, 0.01 mm/px, 4 px": lambda folder: specimen(folder, size=0.33, pixel_size=0.01),

@@ -361,6 +361,18 @@ def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> Non
     assert "out[/bold]/report.html" in text
 
 
+def test_warnings_stand_beside_the_findings(tmp_path: Path) -> None:
+    from modeharvest.report.model.content import Report
+    from modeharvest.report.model.output import write_page
+
+    warnings, page = [f"warning {n}" for n in range(5)], tmp_path / "page.html"
+    write_page(Report("kind", "title", findings=["found"], warnings=warnings), page)
+    findings, notes = page.read_text("utf-8").split('<section id="findings">')[1].split('id="notes"')
+    assert all(text in findings for text in ("found", *warnings[:3], "2 more in the notes"))
+    assert not any(text in findings for text in warnings[3:])
+    assert all(text in notes for text in warnings[3:])
+
+
 def test_no_bar_is_no_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError), messages.bars():
         raise InputError("before the first step")

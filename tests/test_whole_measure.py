@@ -25,8 +25,8 @@ from modeharvest.idic.finite_element.measure import (
 )
 from modeharvest.idic.finite_element.result import NodalResult, refitted
 from modeharvest.idic.modes import square_family
-from modeharvest.idic.result import Result
 from modeharvest.idic.photograph.displacement import displacement_from
+from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError

@@ -165,9 +165,7 @@ def not_compared(correlation: MeshCorrelation) -> NotCompared:
     return NotCompared(blank, correlation.hidden & ~in_f, gone)
 
 
-def mismatches(
-    correlation: MeshCorrelation, at: Linearised, lost: NotCompared
-) -> tuple[str, ...]:
+def mismatches(correlation: MeshCorrelation, at: Linearised, lost: NotCompared) -> tuple[str, ...]:
     """Warnings of places without speckle, of changed surfaces, and of images that don't match."""
     found, counts = [], np.diff(correlation.on(FULL).pixels.start)
     total, mesh = counts.sum() + correlation.hidden.sum(), correlation.body.mesh

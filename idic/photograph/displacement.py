@@ -116,12 +116,7 @@ def displacement_from(
 
     def seen(u: FloatArray, off_px: float, degree: int) -> ImagePair:
         """The images, equally bright, without what shows background if edges are off this much."""
-        folded = np.zeros(len(mesh.cells), np.bool_)
-        folded[non_positive_jacobians(mesh.nodes + u, mesh.cells, mesh.element)] = True
-        if folded.any():  # where they are is known from around
-            known = body.away_from(folded)
-            around = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
-            u = np.where(known[:, None], u, around)
+        u = _unfolded(u, body, _SMOOTH_PX * pair.grid.pixel_size)
         pair_alike = alike(pair, mesh, u, degree)
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(pair_alike, deformed_mask=mask)
@@ -154,6 +149,16 @@ def displacement_from(
         if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
             break
     return smoother
+
+
+def _unfolded(u: FloatArray, body: Body, wave: float) -> FloatArray:
+    """u (n, 2) [mm], but that around them, of waves so long [mm], at nodes of folded elements."""
+    mesh, folded = body.mesh, np.zeros(len(body.mesh.cells), np.bool_)
+    folded[non_positive_jacobians(mesh.nodes + u, mesh.cells, mesh.element)] = True
+    if not folded.any():
+        return u
+    known = body.away_from(folded)
+    return np.where(known[:, None], u, body.smoothed(u, wave, known))
 
 
 def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:

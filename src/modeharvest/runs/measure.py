@@ -390,7 +390,7 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _image(self, name: str, result: NodalResult) -> dict[str, Any]:
         px, mask = self.grid.pixel_size, self.material.mask
         u = result.displacement_on()
-        known = np.isfinite(u).all(axis=-1)
+        known = np.asarray(np.isfinite(u).all(axis=-1))
         inside = u[mask & known] / px
         numbers = {
             "name": name,
