@@ -212,10 +212,13 @@ class MeshCorrelation:
 
     def moved(self, some: ElementPixels) -> tuple[FloatArray, FloatArray]:
         """Rows and columns (p,) to which u takes some of the unfiltered pixels [px]."""
-        N, cells = shape_functions("T6", some.xi.T), self.body.mesh.cells
-        nodal = self.u.reshape(-1, 2)[np.repeat(cells, np.diff(some.start), axis=0)]
-        right, up = np.einsum("pk,pki->ip", N, nodal) / self.pair.grid.pixel_size
-        return some.row - up, some.col + right
+        nodal, count = self.u.reshape(-1, 2) / self.pair.grid.pixel_size, np.diff(some.start)
+        row, col = some.row.astype(np.float64), some.col.astype(np.float64)
+        each = zip(shape_functions("T6", some.xi.T).T, self.body.mesh.cells.T, strict=True)
+        for N, nodes in each:  # one node of all elements after the other, to save memory
+            row -= N * np.repeat(nodal[nodes, 1], count)
+            col += N * np.repeat(nodal[nodes, 0], count)
+        return row, col
 
     def residual(self, some: ElementPixels) -> FloatArray:
         """(rows, cols) f - g(x + u) of some of the unfiltered pixels, else NaN [grey levels]."""

@@ -18,7 +18,7 @@ from modeharvest.idic.finite_element.equations.pixels import ElementPixels
 from modeharvest.idic.finite_element.equations.system import Linearised
 from modeharvest.idic.solver.noise import power_of_long_waves
 from modeharvest.idic.solver.pyramid import FULL
-from modeharvest.util.arrays import BoolArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.masks import grown, large_parts
 
 _UNLIKE = 0.25
@@ -40,7 +40,8 @@ _SPECK, _OF_SPECKLE, _ROUNDS = 6, 0.25, 3
 at least; largest number of searches. Residuals of displacements that aren't resolved exceed the
 limit in up to 5 connected pixels of speckle of 4 px."""
 _SAMPLED = 200_000
-"""Pixels from which noise is estimated."""
+_EVERY = 8
+"""Pixels from which noise is estimated; or one of so many."""
 _WITHOUT = 0.01
 """Share of the material in elements without speckle above which a warning is given [-]."""
 _GUESS = (
@@ -83,8 +84,10 @@ def leave_out_specks(correlation: MeshCorrelation, *stages: Stage) -> None:
     """
     least = max(_SPECK, (_OF_SPECKLE * correlation.speckle_px) ** 2)
     for _ in range(_ROUNDS):
-        residual = np.nan_to_num(correlation.residual(correlation.on(FULL).pixels))
-        specks = large_parts(np.abs(residual) > _limit(correlation), least)
+        pixels = correlation.on(FULL).pixels
+        residual = correlation.residual(pixels)
+        limit = _limit(pixels, residual[pixels.row, pixels.col][::_EVERY])
+        specks = large_parts(np.abs(residual) > limit, least)
         if not specks.any():
             break
         correlation.without(correlation.hidden | grown(specks, BESIDE_PX))
@@ -92,11 +95,9 @@ def leave_out_specks(correlation: MeshCorrelation, *stages: Stage) -> None:
             correlation.through(stage)
 
 
-def _limit(correlation: MeshCorrelation) -> float:
-    """Residual beyond which pixels differ [grey levels]; its median shows noise of any kind."""
-    pixels = correlation.on(FULL).pixels
-    residual = correlation.residual(_some(pixels))
-    noise = median_abs_deviation(residual, axis=None, scale="normal", nan_policy="omit")
+def _limit(pixels: ElementPixels, residual: FloatArray) -> float:
+    """Residual beyond which pixels differ [grey levels], from that of many of them (k,)."""
+    noise = median_abs_deviation(residual, scale="normal", nan_policy="omit")  # of any kind
     return _DIFFERS * float(pixels.grey.std()) + _BY_CHANCE * float(noise)
 
 
@@ -114,7 +115,8 @@ def _hide(correlation: MeshCorrelation, cells: BoolArray, *stages: Stage) -> Non
     if there.row.size > _MOST_HIDDEN * on.pixels.row.size:
         return
     differ: BoolArray = np.ones(there.row.size, np.bool_)
-    limit = _limit(correlation)
+    some = _some(on.pixels)
+    limit = _limit(on.pixels, correlation.residual(some)[some.row, some.col])
     for then in (stages, full, full):  # blurred images mix them with what is around
         hidden = np.zeros_like(before)
         hidden[there.row[differ], there.col[differ]] = True
@@ -157,12 +159,24 @@ class NotCompared(NamedTuple):
 def not_compared(correlation: MeshCorrelation) -> NotCompared:
     """The pixels of the material that don't count at the present displacement."""
     pixels, (in_f, in_g) = correlation.on(FULL).pixels, correlation.blank
+    if not in_g.any() and _in_picture(correlation):
+        return NotCompared(in_f, correlation.hidden & ~in_f, np.zeros_like(in_f))
     row, col = (np.rint(at).astype(int) for at in correlation.moved(pixels))
     stays = (row >= 0) & (row < in_g.shape[0]) & (col >= 0) & (col < in_g.shape[1])
     blank, gone = in_f.copy(), np.zeros_like(in_f)
     gone[pixels.row[~stays], pixels.col[~stays]] = True
     blank[pixels.row[stays], pixels.col[stays]] = in_g[row[stays], col[stays]]
     return NotCompared(blank, correlation.hidden & ~in_f, gone)
+
+
+def _in_picture(correlation: MeshCorrelation) -> bool:
+    """Whether all nodes are moved to pixels of the deformed image, clear of its border."""
+    grid, nodes = correlation.pair.grid, correlation.body.mesh.nodes
+    where = grid.to_px(*(nodes + correlation.u.reshape(-1, 2)).T)
+    return all(
+        at.min() > BESIDE_PX and at.max() < most - BESIDE_PX
+        for at, most in zip(where, grid.shape, strict=True)
+    )
 
 
 def mismatches(correlation: MeshCorrelation, at: Linearised, lost: NotCompared) -> tuple[str, ...]:
