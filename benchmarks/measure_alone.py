@@ -179,6 +179,25 @@ def rigid(
     return [image(points), image((points - np.array(shift)) @ F)], _inside(points, sides), u
 
 
+def painted(folder: Path, shift: tuple[float, float], size: float) -> Images:
+    """Images of black and white paint with edges sharper than a pixel, which shifts.
+
+    ``size``: about that of its speckles [px]. Pixels show the mean of 8 x 8 points of themselves.
+    """
+    grid, spec = PixelGrid.centred(300, 400, 1.0), fine_speckle()
+    factor = size / 5.0
+    spec = replace(spec, standard_deviation=spec.standard_deviation / factor,
+                   blur_px=spec.blur_px * factor)  # fmt: skip
+    speckle, part = Speckle(spec, grid.shape), (np.arange(8) - 3.5) / 8.0
+    x, y = np.meshgrid(grid.x, grid.y)
+
+    def image(u: float, v: float) -> np.ndarray:
+        points = ((x + dx - u, y + dy - v) for dx in part for dy in part)
+        return np.mean([0.2 + 0.6 * (speckle(*grid.to_px(*at)) > 0.5) for at in points], axis=0)
+
+    return [image(0.0, 0.0), image(*shift)], np.ones(x.shape, bool), np.full((*x.shape, 2), shift)
+
+
 def _inside(points: np.ndarray, sides: tuple[float, float]) -> np.ndarray:
     return np.asarray((abs(points) < sides).all(axis=-1))
 
@@ -239,6 +258,12 @@ CASES: dict[str, Callable[[Path], Images]] = {
     ),
     "turn by 10°, noise of 1 %, JPEG": lambda folder: rigid(
         folder, (5.3, -8.6), 10.0, 0.01, camera=compressed
+    ),
+    "paint of 4 px, sharp edges, shift by 0.3 px": lambda f: painted(f, (0.3, 0.1), 4.0),
+    "paint of 8 px, sharp edges, shift by 0.3 px": lambda f: painted(f, (0.3, 0.1), 8.0),
+    "paint of 12 px, sharp edges, shift by 0.3 px": lambda f: painted(f, (0.3, 0.1), 12.0),
+    "the same, noise of 2 %": lambda folder: photographed(
+        painted(folder, (0.3, 0.1), 12.0), white, 0.02
     ),
     "stretched by 30 % in one step": lambda folder: stretch(folder, [0.3]),
     "stretched by 50 % in 5 steps": lambda folder: stretch(folder, [0.1, 0.2, 0.3, 0.4, 0.5]),

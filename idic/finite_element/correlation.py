@@ -26,6 +26,7 @@ from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.free_edges import FreeEdges
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
+from modeharvest.idic.solver.sampling import well_sampled
 from modeharvest.idic.solver.weighting import best_blur
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
@@ -91,9 +92,12 @@ class MeshCorrelation:
         pair = pair if body.mask is None else replace(pair, mask=pair.masks[0] & body.mask)
         pair = pair.without_extremes()
         self.speckle_px = speckle_size(pair.reference, pair.mask)
+        given, pair = pair, well_sampled(pair, self.speckle_px)
+        self.is_sharp = pair is not given
+        """Whether the speckle has edges sharper than pixels: paint of few grey levels."""
         self.order = spline_order(self.speckle_px)
         self.blank: tuple[BoolArray, ...] = tuple(
-            grown(flat(image, mask, self.speckle_px), BESIDE_PX) & mask
+            mask & (not self.is_sharp) & grown(flat(image, mask, self.speckle_px), BESIDE_PX)
             for image, mask in zip((pair.reference, pair.deformed), pair.masks, strict=True)
         )
         """(rows, cols) True for pixels of each image without speckle."""

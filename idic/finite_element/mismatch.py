@@ -136,7 +136,8 @@ def noise_power(correlation: MeshCorrelation) -> float:
     some = _some(pixels, np.repeat(~unlike(correlation), np.diff(pixels.start)))
     residual = correlation.residual(some)
     contrast = float(some.grey.std()) if some.grey.size else 0.0
-    return power_of_long_waves(np.nan_to_num(residual), np.isfinite(residual), contrast)
+    where, at_edges = np.isfinite(residual), correlation.is_sharp
+    return power_of_long_waves(np.nan_to_num(residual), where, contrast, at_edges)
 
 
 def matched(correlation: MeshCorrelation) -> BoolArray:

@@ -74,19 +74,24 @@ def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> C
     return CameraNoise(sd, source)
 
 
-def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise:
+def estimated_noise(
+    image: NDArray[Any], mask: NDArray[np.bool_], at_edges: bool = False
+) -> CameraNoise:
     """Estimate the noise from a single image (rows, cols), by details finer than any pattern.
 
     The difference of two Laplacians weighs white noise by 6 and a pattern by (k_x k_y)^2, k its
     wave number in rad/px. The estimate is too large if speckles are about 2 px themselves. The mask
-    is True on material.
+    is True on material. A median is taken, or the mean if most noise is ``at_edges`` of speckles.
 
     Source: J. Immerkaer, Comput. Vis. Image Underst. 64 (1996), doi 10.1006/cviu.1996.0060.
     """
     second = np.array([1.0, -2.0, 1.0])
     details = ndimage.convolve(image.astype(np.float64), np.outer(second, second))
     off = details[ndimage.binary_erosion(mask, iterations=2)]
-    sd = np.median(abs(off - np.median(off))) / (6.0 * special.ndtri(0.75))
+    if at_edges and off.size:
+        sd = off.std() / 6.0
+    else:
+        sd = np.median(abs(off - np.median(off))) / (6.0 * special.ndtri(0.75))
     return CameraNoise(
         float(sd), "estimated from the finest details of the reference: two exposures measure it"
     )
@@ -98,14 +103,17 @@ width of a Gaussian by which noise may be correlated [px]; ratio of its estimate
 pixels to that from pixels, up to which it is white: interpolation makes it 1.2."""
 
 
-def power_of_long_waves(residual: NDArray[Any], mask: BoolArray, contrast: float) -> float:
+def power_of_long_waves(
+    residual: NDArray[Any], mask: BoolArray, contrast: float, at_edges: bool = False
+) -> float:
     """Power of noise at long waves, over its variance: 1 if white, more if neighbours share it.
 
     Cameras that compute colours, smooth or compress correlate the noise of neighbouring pixels. The
     correlation is assumed to be that of white noise blurred by a Gaussian, whose width follows from
     two estimates: by the finest details, and by those of means over 2 x 2 pixels. ``residual``
     (rows, cols) of two images of speckle, which doesn't show in it; ``mask`` True where it counts;
-    ``contrast``: standard deviation of the speckle [grey levels].
+    ``contrast``: standard deviation of the speckle [grey levels]; ``at_edges``: whether most noise
+    is at edges of speckles, as aliases of undersampled images are.
     """
     rows, cols = (2 * (n // 2) for n in mask.shape)
     means, inside = (
@@ -114,7 +122,8 @@ def power_of_long_waves(residual: NDArray[Any], mask: BoolArray, contrast: float
     )
     if not ndimage.binary_erosion(inside == 1.0, iterations=2).any():
         return 1.0
-    fine, coarse = estimated_noise(residual, mask).sd, estimated_noise(means, inside == 1.0).sd
+    fine = estimated_noise(residual, mask, at_edges).sd
+    coarse = estimated_noise(means, inside == 1.0, at_edges).sd
     ratio, widths = 2.0 * coarse / max(fine, 1e-12), np.linspace(0.0, _WIDEST_PX, 61)
     if ratio <= _WHITE or 2.0 * coarse <= _LEAST_NOISE * contrast:
         return 1.0
