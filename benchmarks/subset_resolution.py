@@ -161,10 +161,12 @@ def grade_whole(star_set: StarSet, options: argparse.Namespace) -> None:
             assert cutoff is not None
             at, n = graded.attenuation, graded.noise
             found.append((cutoff, at.finest_px, 1e3 * n.v_px, graded.indicator_px2))
-        cutoff, *mean = np.mean(found, axis=0)
-        sd = np.std(found, axis=0, ddof=1)[1:]
+        cutoff, *mean = np.nanmean(found, axis=0)
+        sd = np.nanstd(found, axis=0, ddof=1)[1:]
         finest, floor = 9.0 ** (1.0 / 6.0) * cutoff, level / cutoff * FLOOR
         cells = [f"{cutoff:.1f}" + " (found)" * (wanted == "found")]
+        if count := sum(np.isnan(l10) for _, l10, _, _ in found):
+            print(f"{count} of {MESHES} meshes keep 0.9 of every wave, or of none:")
         for of, by, theory, digits in zip(
             mean, sd, (finest, 1e3 * floor, floor * finest), (1, 2, 3), strict=True
         ):
