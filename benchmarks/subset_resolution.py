@@ -166,7 +166,7 @@ def grade_whole(star_set: StarSet, options: argparse.Namespace) -> None:
         finest, floor = 9.0 ** (1.0 / 6.0) * cutoff, level / cutoff * FLOOR
         cells = [f"{cutoff:.1f}" + " (found)" * (wanted == "found")]
         if count := sum(np.isnan(l10) for _, l10, _, _ in found):
-            print(f"{count} of {MESHES} meshes keep 0.9 of every wave, or of none:")
+            cells[0] += f", {MESHES - count} meshes"  # others keep 0.9 of all waves, or of none
         for of, by, theory, digits in zip(
             mean, sd, (finest, 1e3 * floor, floor * finest), (1, 2, 3), strict=True
         ):
