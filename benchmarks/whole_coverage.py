@@ -173,7 +173,8 @@ def refitted_against(best: Result, refit: Result) -> dict[str, tuple[float, floa
 def table(rows: list[Row]) -> None:
     """Print the table of displacements and strains."""
     print(
-        "| images | of | rms error, all / edges | rms bar | 95 % intervals hold, all | at edges |"
+        "| images | of | rms error, all / edges | rms standard deviation, all / edges "
+        "| 95 % intervals hold, all | at edges |"
     )
     print("|---" * 6 + "|")
     for noise in sorted({row.noise for row in rows}):
@@ -191,14 +192,16 @@ def table(rows: list[Row]) -> None:
                 for m, s, least in zip(covered.mean(axis=0), sd, covered.min(axis=0), strict=True)
             ]
             sizes = (" / ".join(f"{scale * v:.3g}" for v in pair) for pair in (error, bar))
-            cells = [f"{100 * noise:g} %" if noise else "8 bit", name,
+            cells = [f"{100 * noise:g} %" if noise else "8 bit",
+                     name if name == "u" else f"E_{name}",
                      *(text + unit for text in sizes), *shares]  # fmt: skip
             print(f"| {' | '.join(cells)} |")
 
 
 def refit_table(rows: list[Row]) -> None:
     """Print the table of the refitted ansatz."""
-    print("\n| images | of the refitted ansatz | 95 % intervals hold | rms error / its sd |")
+    print("\n| images | of the refitted ansatz | 95 % intervals hold "
+          "| rms error over standard deviation |")  # fmt: skip
     print("|---" * 4 + "|")
     for noise in sorted({row.noise for row in rows}):
         for name in rows[0].refit:

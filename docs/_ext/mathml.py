@@ -20,7 +20,10 @@ def _mathml(latex: str, display: str) -> str:
     if unknown := re.search(r">\\(\w+)<", found):
         raise ExtensionError(f"an equation can't be converted: {latex!r}: \\{unknown[1]}")
     # Without the class, browsers use letters of mathematical italics, which few fonts have.
-    return re.sub(r"<mi>(\w|&#x0*3[0-9A-Fa-f]{2};)</mi>", r'<mi class="letter">\1</mi>', found)
+    found = re.sub(r"<mi>(\w|&#x0*3[0-9A-Fa-f]{2};)</mi>", r'<mi class="letter">\1</mi>', found)
+    # Fonts without a table of mathematics lower subscripts below the depth of their base alone.
+    base = r"<msub>(<m[io][^>]*>[^<]*</m[io]>)"
+    return re.sub(base, r'<msub><mpadded depth="0.25em">\1</mpadded>', found)
 
 
 def _inline(self: Any, node: nodes.math) -> None:
