@@ -46,7 +46,7 @@ CELLULAR = Box.centred(6 * PITCH, 8 * PITCH)
 DOMAIN = Box.centred(6 * PITCH + 1.6, 8 * PITCH + 1.6)
 STRAINS = (0.03, 0.05, 0.06, 0.07)
 FULL_SCALE = 255.0
-DEGREES = {"none": None, "0": 0, "1": 1, "2": 2}
+DEGREES: dict[str, int | str] = {"none": "none", "0": 0, "1": 1, "2": 2}
 
 Light = Callable[[int, FloatArray, FloatArray], tuple[FloatArray, float]]
 """Gain [-] and offset [grey levels] of photograph 1 to 4, at x and y from -1 to 1."""
@@ -126,7 +126,7 @@ def photograph(strain: float, light: Light, number: int) -> FloatArray:
 
 
 def harvested(
-    folder: Path, light: Light, degree: int | None, whole: bool
+    folder: Path, light: Light, degree: int | str, whole: bool
 ) -> tuple[HarvestRun, float]:
     """Take the photographs and harvest them; processor seconds."""
     for k, strain in enumerate((0.0, *STRAINS)):
@@ -139,7 +139,7 @@ def harvested(
         f"[whole_field]\nmeasure = {str(whole).lower()}\n"
     )
     case, begin = PhotographCase.read(folder / "case.toml"), time.process_time()
-    how = replace(case.correlation, gain_degree=degree, offset_degree=degree)
+    how = replace(case.correlation, brightness=degree)
     run = HarvestRun(case.model_copy(update={"correlation": how}), folder / "out")
     run.results()
     return run, time.process_time() - begin

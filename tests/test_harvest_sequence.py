@@ -128,11 +128,14 @@ def test_light_that_changes_along_the_material_is_reported(tmp_path: Path) -> No
     shown.save(tmp_path, {"frame_1": truth(0.03)})
     light, frame = np.linspace(0.93, 1.0, shown.grid.cols), tmp_path / "frame_1.tif"
     tifffile.imwrite(frame, np.uint8(light * tifffile.imread(frame)))
-    even = "gain_degree = 0\noffset_degree = 0\n"
-    for name, more, count in (("even", even, 1), ("default", "", 0)):
+    none, even = 'brightness = "none"\n', "brightness = 0\n"
+    for name, more, count in (("none", none, 1), ("even", even, 1), ("default", "", 0)):
         (tmp_path / f"{name}.toml").write_text(experiment("total") + more)
         case = PhotographCase.read(tmp_path / f"{name}.toml")
-        (row,) = HarvestRun(case, tmp_path / name).harvest().numbers
+        run = HarvestRun(case, tmp_path / name)
+        (row,) = run.harvest().numbers
+        unknowns = [a for a in run.results()["frame_1"].result.ansatz.names if "gain" in a]
+        assert len(unknowns) == {"none": 0, "even": 1, "default": 3}[name]
         assert sum("light changed" in text for text in row["warnings"]) == count
 
 

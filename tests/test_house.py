@@ -65,7 +65,7 @@ SHARED_DATA = (
 GAUGES_AND_FORMATS = (
     "idic/local/tables.py", "idic/local/field.py", "idic/local/formats.py",
     "idic/local/export.py",
-    "idic/photograph/gauges.py",
+    "idic/photograph/gauges.py", "idic/photograph/axes.py",
     "idic/photograph/finished.py", "src/modeharvest/report/figures/on_photographs.py",
     "src/modeharvest/cli/fields.py",
 )  # fmt: skip

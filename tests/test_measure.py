@@ -553,6 +553,7 @@ def test_light_that_changes_along_the_image_does_not_enter_the_displacement() ->
         ("black mask", "expected a mask with material"),
         ("mask of NaN", "expected a mask of finite numbers"),
         ("pixel size", "expected a pixel size [mm] of 1e-09 to 1e+06, got 1e-300"),
+        ("brightness", "expected a degree of gain and offset, 0 (even) to 6, or 'none', got '0.5'"),
         ("mesh", "expected a mesh that covers the mask"),
         ("mesh beside", "expected a mesh on the image"),
         ("mesh twice", "expected elements that don't overlap"),
@@ -588,6 +589,7 @@ def test_bad_input_is_one_line(
         write_image(bad, np.ascontiguousarray(images[what]))
     options = ["--mask", bad if "mask" in what else plate.folder / "mask.tif"]
     options += ["--pixel-size", "1e-300"] if what == "pixel size" else []
+    options += ["--brightness", "0.5"] if what == "brightness" else []
     if what.startswith("mesh"):
         times = 2 if what == "mesh twice" else 1
         corners = np.array([[-0.9, 0.5, 0.0], [0.0, 0.5, 0.0], [-0.9, 0.8, 0.0]])
@@ -603,6 +605,7 @@ def test_bad_input_is_one_line(
     command = ["measure", plate.folder / "ref.tif", deformed, *options, "--out", tmp_path / "out"]
     assert called(monkeypatch, *command) == 2
     assert message in error_line(capsys)
+    assert what != "missing" or not (tmp_path / "out").exists()
 
 
 def test_a_folded_element_takes_no_other_s_material_from_the_deformed_image() -> None:

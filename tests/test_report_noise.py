@@ -45,7 +45,7 @@ def finished(folder: Path, correlation: str) -> Run:
 
 @pytest.fixture(scope="module")
 def exposed(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    options = "camera = true\ngain_degree = 1\noffset_degree = 0"
+    options = "camera = true\nbrightness = 1"
     run = finished(tmp_path_factory.mktemp("camera"), options)
     run.validate()
     return run

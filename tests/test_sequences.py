@@ -20,6 +20,7 @@ from modeharvest.idic.modes import square_family
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.photographs.sequence import Video, natural, numbered, odd_numbers, times_of
+from modeharvest.runs.measure import measure
 from modeharvest.runs.photographs.machine_log import LogTable, read_log
 from modeharvest.runs.photographs.pipeline import harvest
 from modeharvest.runs.photographs.sequence import ChosenFrames, FrameChoice, chosen_frames
@@ -57,6 +58,8 @@ def film(path: Path, count: int, rate: float = 4.0) -> Path:
 
 def chosen(base: Path, *names: str, log: LogTable | None = None, **choice: object) -> ChosenFrames:
     how = FrameChoice(**choice)  # type: ignore[arg-type]
+    if not (base / "ref.tif").exists():
+        write_image(base / "ref.tif", grey(10))
     return chosen_frames(base, "ref.tif", names, how, log or LogTable(), base / "out")
 
 
@@ -94,6 +97,20 @@ def test_an_empty_folder_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "shots").mkdir()
     with pytest.raises(InputError, match="found none among its 0 entries"):
         chosen(tmp_path, "shots")
+
+
+def test_a_name_of_no_file_is_one_line_before_any_frame_is_written(tmp_path: Path) -> None:
+    for name in ("ref", "f1"):
+        write_image(tmp_path / f"{name}.tif", grey(10))
+    for names in (["f1.tif", "nothing.tif"], ["shots"]):
+        with pytest.raises(InputError, match=f"{names[-1]}, found no such file; check its name"):
+            chosen(tmp_path, *names)
+    video = film(tmp_path / "test.mp4", 3)
+    with pytest.raises(InputError, match="found no such file"):
+        chosen(tmp_path, video.name, "nothing.tif")
+    with pytest.raises(InputError, match="expected a file at no"):
+        measure(video, [video], tmp_path / "out", mask=Path("no.png"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_missing_and_repeated_numbers_are_reported() -> None:

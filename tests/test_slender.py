@@ -78,5 +78,5 @@ def test_strains_are_along_the_specimens_own_axes(tmp_path: Path) -> None:
     assert ("L", "engineering_strain") in read
     assert read["P", "strain_11"] < 0.0195  # its own angle counts
     assert "the specimen’s axis, 12° to x" in (tmp_path / "out/report.html").read_text("utf-8")
-    with pytest.raises(InputError, match=r"expected an angle .* got 100"):
-        measure(*files, angle=100.0)
+    with pytest.raises(InputError, match=r"--angle: expected .* got 192; the same axis is at 12$"):
+        measure(*files, angle=192.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,17 @@ def test_a_harvest_turns_the_specimen_back(run: HarvestRun, name: str) -> None:
     strain = run.harvest().timeline[list(TURNS).index(name)]
     assert strain.strain == pytest.approx(0.06, abs=5e-4)
     assert strain.has_pattern
+
+
+def test_its_strain_is_along_the_axis_in_the_case_without_measuring_again(run: HarvestRun) -> None:
+    before = {name: path.stat().st_mtime_ns for name in TURNS
+              for path in [run.folder / f"results/{name}.json"] if run.results()}  # fmt: skip
+    specimen = replace(run.case.specimen, angle=30.0)
+    again = HarvestRun(run.case.model_copy(update={"specimen": specimen}), run.folder)
+    expected = 1.0 - np.linalg.norm(np.diag([0.94, 1.0]) @ [np.cos(np.pi / 6), 0.5])
+    assert [m.strain for m in again.harvest().timeline] == pytest.approx([expected] * 2, abs=5e-4)
+    after = {name: (run.folder / f"results/{name}.json").stat().st_mtime_ns for name in TURNS}
+    assert after == before
 
 
 @pytest.mark.usefixtures("undrawn_pictures")

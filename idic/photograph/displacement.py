@@ -103,18 +103,19 @@ class _Swept(NamedTuple):
 
 def displacement_from(
     start: FloatArray, pair: ImagePair, body: Body, options: FiniteElementOptions = _LAST,
-    progress: Progress = silent, light_degree: int = 0,
+    progress: Progress = silent, light_degree: int | None = 0,
 ) -> NodalResult:  # fmt: skip
     """Measure a photograph's displacement on a mesh, from an initial guess (n, 2) at nodes [mm].
 
     ``pair``: with the mask of the reference; brightness may differ. InputError if the images don't
     overlap; and as for :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
-    ``light_degree``: of the polynomials by which gain and offset vary over the reference.
+    ``light_degree``: of the polynomials by which gain and offset vary over the reference; None
+    for images of one brightness.
     """
     mesh = body.mesh
     is_sought = pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None
 
-    def seen(u: FloatArray, off_px: float, degree: int) -> ImagePair:
+    def seen(u: FloatArray, off_px: float, degree: int | None) -> ImagePair:
         """The images, equally bright, without what shows background if edges are off this much."""
         folded = np.zeros(len(mesh.cells), np.bool_)
         folded[non_positive_jacobians(mesh.nodes + u, mesh.cells, mesh.element)] = True
@@ -126,7 +127,7 @@ def displacement_from(
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(pair_alike, deformed_mask=mask)
 
-    def swept(degree: int) -> _Swept:
+    def swept(degree: int | None) -> _Swept:
         """Repeat the first measurement until the images match everywhere, or no better."""
         better, u, unknown = start, start, 0 if pair.deformed_mask is not None else len(start)
         for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
@@ -262,7 +263,7 @@ def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) ->
     return inner if inner is not None and inner.any() else None
 
 
-def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
+def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int | None) -> ImagePair:
     """Make brightness and contrast of the pair equal, in the reference's levels; u (n, 2) [mm]."""
     at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
     gain, offset = brightness(pair, np.moveaxis(at, 0, -1), degree)
@@ -271,13 +272,17 @@ def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
     return pair.with_images(reference.astype(np.float32), a * pair.deformed + b)
 
 
-def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatArray, FloatArray]:
+def brightness(
+    pair: ImagePair, u: FloatArray, degree: int | None = 0
+) -> tuple[FloatArray, FloatArray]:
     """Gain [-] and offset [grey levels], (rows, cols), that make g(x + u) as bright as f.
 
     Polynomials of total degree ``degree`` that give both images the same mean and contrast: so a
     displacement that is off by some pixels hardly matters. Edges and pixels that don't match don't
-    count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known.
+    count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known. Degree None: neither, 1 and 0.
     """
+    if degree is None:
+        return np.ones(pair.grid.shape), np.zeros(pair.grid.shape)
     grid, inner = pair.grid, shrunk(pair.masks[0], _OFF_PX[0])
     inner = (inner if inner.any() else pair.masks[0]) & np.isfinite(u).all(axis=-1)
     every = max(1, int(inner.sum() / _SAMPLES))
@@ -301,7 +306,7 @@ def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatAr
     return np.maximum(a, _LEAST * a[pair.masks[0]].mean()), b
 
 
-def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
+def residual(pair: ImagePair, u: FloatArray, degree: int | None = 0) -> FloatArray:
     """(rows, cols) f - gain g(x + u) - offset [grey levels]; NaN outside material and image."""
     gain, offset = brightness(pair, u, degree)
     known = pair.masks[0] & np.isfinite(u).all(axis=-1)
@@ -311,19 +316,20 @@ def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
     return found
 
 
-def uneven_light(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[str, ...]:
+def uneven_light(pair: ImagePair, u: FloatArray, degree: int | None = 0) -> tuple[str, ...]:
     """Warn if the light changed over the material otherwise than by polynomials of a degree.
 
     ``u`` (rows, cols, 2) [mm].
     """
     mask, typical = pair.masks[0], float(pair.reference[pair.masks[0]].mean())
-    maps = (brightness(pair, u, of) for of in (degree, degree + 1))
+    of = degree or 0
+    maps = (brightness(pair, u, each) for each in (of, of + 1))
     level, finer = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
     change = float(np.ptp(finer - level) / abs(finer.mean()))
     text = (
         f"The light changed along the material, by {100 * change:.0f} %, which is taken for "
-        f"displacement: measure with --brightness {degree + 1} or {degree + 2}, harvest with "
-        f"gain_degree {degree + 1} or {degree + 2}."
+        f"displacement: measure with --brightness {of + 1} or {of + 2}, harvest with brightness = "
+        f"{of + 1} or {of + 2} in [correlation]."
     )
     return (text,) * (change > _UNEVEN)
 

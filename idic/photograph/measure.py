@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz, for_cells
+from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.correlate import ASTRAY, correlate
 from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
@@ -178,7 +179,7 @@ def measure_whole(
         start, normalised = "blocks of the speckle", pair
         slow, _ = first_motion(geometry.region.domain, pair, first.local)
         begin = block_motion(pair, body, slow(mesh.nodes))
-    light = max(how.brightness.degrees, default=0)
+    light = Brightness.of(how.brightness).degree
     measured = displacement_from(begin, normalised, body, on_mesh, progress, light)
     noise = image_noise(pair, camera)
     expected = float(np.hypot(noise.reference, noise.deformed))
@@ -226,7 +227,7 @@ def found_modes(
 
 def with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
     """Ansatz and unknowns of a result with the specified brightness, as an initial guess."""
-    ansatz = replace(result.ansatz, brightness=how.brightness)
+    ansatz = replace(result.ansatz, brightness=Brightness.of(how.brightness))
     first = result.ansatz.phi_offset(len(result.ansatz.modes))
     start = np.zeros(ansatz.size)
     start[:first] = result.unknowns[:first]

@@ -55,7 +55,7 @@ from modeharvest.validation.onset import load_axis, mean_strain
 
 _PIXELS = 0.8e6
 """Approximate number of pixels of a binned photograph."""
-_DEGREES = AnsatzOptions(v0_degree=5, v_degree=4, gain_degree=0, offset_degree=0)
+_DEGREES = AnsatzOptions(v0_degree=5, v_degree=4, brightness=0)
 _QUICK = CorrelationOptions(
     levels=(Level(2, 1.0), FULL), order=3, gradient="deformed",
     gauss_newton=GaussNewtonOptions(tolerance_px=1e-3),
@@ -214,7 +214,7 @@ class QuickMeasurement:
         inside = cellular.contains(*np.meshgrid(few.x, few.y))
         pattern = result.fluctuation(0, few)[inside] / self.grid.pixel_size
         self.thumbnail = pair.deformed
-        strains = mean_strain(result, cellular)
+        strains = mean_strain(result, cellular, self.case.specimen.angle)
         strain = strains[load_axis(np.array([strains]))]
         row = {"name": path.name, "strain": strain, "amplitude_mm": amplitude, "sd_mm": sd}
         row |= {"model_sd_mm": model_sd, "pattern_px": float(np.sqrt(np.mean(pattern**2)))}
