@@ -12,6 +12,7 @@ import numpy as np
 from scipy.io import savemat
 
 from modeharvest.idic.finite_element import files as nodal
+from modeharvest.idic.finite_element.fields import field_of, nodal_gradient
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.export import export_field
 from modeharvest.idic.local.field import LocalField
@@ -119,7 +120,8 @@ class FinishedRun:
                     raise InputError(f"expected whole displacements for {form}, {_MODES_ALONE}")
                 found = Result.read(file)
                 field = at_pixels_of_modes(found, _mask_of(file.parent.parent), step)
-                written.append(export_field(f"{path}.x", field, form, found.grid))
+                strains = _tensors(_gradient_of_modes(found, field.points))
+                written.append(export_field(f"{path}.x", field, form, found.grid, tensors=strains))
                 continue
             result = self.result(name)
             if form in _WHOLE and pixel_size is None:
@@ -135,10 +137,12 @@ class FinishedRun:
                     savemat(part, maps, appendmat=False, do_compression=True)
             else:
                 field, grid, unit = at_pixels(result, step), result.grid, self.unit
+                slopes = nodal_gradient(result.mesh, result.displacement)
+                strains = _tensors(result.at(field.points, slopes))
                 if pixel_size is not None:
                     grid, unit = PixelGrid.centred(*grid.shape, pixel_size), "mm"
                     field = field.scaled(pixel_size)
-                written.append(export_field(f"{path}.x", field, form, grid, unit))
+                written.append(export_field(f"{path}.x", field, form, grid, unit, strains))
         return written
 
     def _maps(self, result: NodalResult, step: int) -> dict[str, FloatArray]:
@@ -152,6 +156,7 @@ class FinishedRun:
         return maps
 
 
+_STEP_PX = 1e-3
 _MODES_ALONE = "got v0 and v1 phi1 alone; harvest with --whole-field, or choose another format"
 _WHOLE: dict[str, tuple[str, Callable[..., None]]] = {
     "csv": (".csv", nodal.write_csv), "hdf5": (".h5", nodal.write_result),
@@ -196,6 +201,24 @@ def at_pixels_of_modes(result: Result, mask: BoolArray, step: int) -> LocalField
     return LocalField(
         table[:, 0], table[:, 1], table[:, 2:4], sd=None if known is None else table[:, 4:]
     )
+
+
+def _gradient_of_modes(result: Result, points: FloatArray) -> FloatArray:
+    """(n, 2, 2) gradient of v0 and v1 phi1 at points [mm], by central differences."""
+    steps = _STEP_PX * result.grid.pixel_size * np.eye(2)
+    ahead, behind = (
+        np.stack(
+            [result.ansatz.displacement_at(result.unknowns, points + s * h) for h in steps], -1
+        )
+        for s in (1, -1)
+    )
+    return np.asarray((ahead - behind) / (2.0 * steps[0, 0]))
+
+
+def _tensors(gradient: FloatArray) -> dict[str, FloatArray]:
+    """The tensors that exports may hold, from displacement gradients (n, 2, 2)."""
+    F = np.eye(2) + gradient
+    return {name: field_of(name, F) for name in ("F", "green_lagrange", "logarithmic")}
 
 
 def _mask_of(folder: Path) -> BoolArray:
