@@ -179,7 +179,7 @@ def measure_whole(
         start, normalised = "blocks of the speckle", pair
         slow, _ = first_motion(geometry.region.domain, pair, first.local)
         begin = block_motion(pair, body, slow(mesh.nodes))
-    light = Brightness.of(how.brightness).degree
+    light = Brightness.of(how.brightness).degree or 0
     measured = displacement_from(begin, normalised, body, on_mesh, progress, light)
     noise = image_noise(pair, camera)
     expected = float(np.hypot(noise.reference, noise.deformed))

@@ -43,14 +43,15 @@ from modeharvest.idic.finite_element.mesh import MeshedMaterial, mesh_of_mask, q
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.photograph.axes import require_angle, strains_along, turned_sides
 from modeharvest.idic.photograph.displacement import (
+    LOCAL,
     block_motion,
     brightness,
     deformed_mask,
     displacement_from,
+    light_for,
     misfit_of,
     residual,
     speckled,
-    uneven_light,
 )
 from modeharvest.idic.photograph.gauges import (
     along_axes,
@@ -97,6 +98,10 @@ _LEAST_PX = 1000
 """Smallest number of pixels that a mesh must cover: about four elements."""
 _OVERLAP = 0.01
 """Largest fraction of a mesh's pixels that may lie in two elements."""
+_LOCAL_LIGHT = (
+    "The light changed along the material otherwise than by polynomials: gain and offset were "
+    "taken from around each pixel, which makes errors larger; light the specimen evenly."
+)
 _MESH_FORMAT = "modeharvest-mesh-1"
 
 
@@ -328,7 +333,8 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN outside the material."""
-        return residual(self.pair(name), result.displacement_on(), self.case.light_degree)
+        pair, u = self.pair(name), result.displacement_on()
+        return residual(pair, u, light_for(pair, u, self.case.light_degree))
 
     def picture(self, name: str) -> FloatImage:
         """(rows, cols) one deformed image, scaled from 0 (black) to 1 (white)."""
@@ -408,7 +414,8 @@ class MeasureRun(StagedRun[MeasureCase]):
             return numbers
         pair = self.pair(name)
         f, material = pair.reference, pair.masks[0]
-        maps = brightness(pair, u, self.case.light_degree)
+        light = light_for(pair, u, self.case.light_degree)
+        maps = brightness(pair, u, light)
         gain, offset = (part[material].mean() for part in maps)
         moved = deformed_mask(self.grid, result.mesh, result.displacement, 0.0)
         noise_g = estimated_noise(pair.deformed, material if moved is None else moved).sd
@@ -422,7 +429,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "warnings": [
                 *result.warnings,
                 *misfit_of(result, noise, f[material]),
-                *uneven_light(pair, u, self.case.light_degree),
+                *(_LOCAL_LIGHT,) * (light == LOCAL),
             ],
         }
 

@@ -34,7 +34,7 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.local.field import read_field, write_field
 from modeharvest.idic.photograph.axes import turned_sides
-from modeharvest.idic.photograph.displacement import uneven_light
+from modeharvest.idic.photograph.displacement import UNEVEN, uneven_light
 from modeharvest.idic.photograph.gauges import along_axes, points_of, reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
@@ -100,6 +100,10 @@ _ALONG = 120
 _BOTH = "", "_speckle"
 """Suffixes of the file names of results by contours, and by speckle for comparison."""
 _MUCH = 0.01
+_UNEVEN = (
+    "The light changed along the material, by {:.0f} %, which is taken for displacement: harvest "
+    "with brightness = {} or {} in [correlation], and light the specimen evenly."
+)
 _LEFT = (
     "{:.0f} % of the material has left the image: there v0 and v1 are extrapolated, with larger "
     "errors than their error bars say; the numbers of the pattern are those of the rest"
@@ -415,7 +419,9 @@ class HarvestRun(StagedRun[PhotographCase]):
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
         if self._plain is None and out < 0.5:
             degree = Brightness.of(case.correlation.brightness).degree
-            left += uneven_light(pair, result.displacement(), degree)
+            change = uneven_light(pair, result.displacement(), degree)
+            finer = 1 + (degree or 0)
+            left += (_UNEVEN.format(100 * change, finer, finer + 1),) * (change > UNEVEN)
         seen = geometry.mask & in_view(result, pair.grid.x, pair.grid.y) if left else geometry.mask
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
