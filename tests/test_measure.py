@@ -377,7 +377,7 @@ def test_light_that_changes_along_the_material_is_reported(
     assert pair.truth is not None
     lit = pair.with_images(pair.reference, light * pair.deformed)
     u = pair.truth.displacement
-    assert (uneven_light(lit, u, degree) > UNEVEN) == bool(count)
+    assert (uneven_light(lit, u, degree, degree + 1) > UNEVEN) == bool(count)
     assert light_for(lit, u, degree) == (LOCAL if count else degree)
     assert light_for(lit, u, None) is None
     slope = pair.with_images(pair.reference, (1.0 + 0.05 * across) * pair.deformed)

@@ -353,7 +353,7 @@ def test_another_time_zone_is_found_and_reported(tmp_path: Path) -> None:
     found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
     forces = [known["force_N"] for known in found.recorded.values()]
     assert forces == pytest.approx([0, 2.5, 5, 1007.5])
-    assert any("-2 h ahead" in note and "time zone" in note for note in found.notes)
+    assert any("2 h behind" in note and "time zone" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

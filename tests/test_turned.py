@@ -107,6 +107,7 @@ def test_measure_follows_it_and_skips_what_is_no_photograph_of_it(
         "f_03_white": np.where(whole > 12, 255, whole).astype(np.uint8),
         "f_04_noise": noise,
         "f_05_small": whole[:-10],
+        "f_07_half": np.where(np.arange(len(whole))[:, None] < 300, whole, 0),
         "f_10": whole,
         "f_11_other": Photographed(SHOWN.grid, DOMAIN, HOLES, 1.4, 8).image(),
     }.items():
@@ -117,7 +118,8 @@ def test_measure_follows_it_and_skips_what_is_no_photograph_of_it(
     reasons = {row["name"]: row["reason"] for row in summary["skipped"]}
     expected = {
         "f_02_dark": "black", "f_03_white": "saturated", "f_04_noise": "blank",
-        "f_05_small": "one size", "f_06_cut": "f_06_cut.tif", "f_11_other": "one surface",
+        "f_05_small": "one size", "f_07_half": "in its last 260 of 560 rows",
+        "f_06_cut": "f_06_cut.tif", "f_11_other": "one surface",
     }  # fmt: skip
     assert set(reasons) == set(expected)
     for name, word in expected.items():

@@ -337,13 +337,14 @@ def residual(pair: ImagePair, u: FloatArray, degree: int | str | None = 0) -> Fl
     return found
 
 
-def uneven_light(pair: ImagePair, u: FloatArray, degree: int | None = 0) -> float:
+def uneven_light(pair: ImagePair, u: FloatArray, degree: int, finer: int | str) -> float:
     """Range of the light's relative change over the material that a degree doesn't describe [-].
 
-    ``u`` (rows, cols, 2) [mm].
+    ``u`` (rows, cols, 2) [mm]; ``finer``: what describes it, another degree, or LOCAL where u is
+    near the truth everywhere.
     """
     mask, typical = pair.masks[0], float(pair.reference[pair.masks[0]].mean())
-    maps = (brightness(pair, u, each) for each in (degree or 0, LOCAL))
+    maps = (brightness(pair, u, each) for each in (degree, finer))
     level, around = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
     low, high = np.quantile(around - level, [0.5 - 0.5 * _MOST, 0.5 + 0.5 * _MOST])
     return float((high - low) / abs(around.mean()))
@@ -351,7 +352,7 @@ def uneven_light(pair: ImagePair, u: FloatArray, degree: int | None = 0) -> floa
 
 def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> int | str | None:
     """The degree, or LOCAL if the light changed otherwise; ``u`` (rows, cols, 2) [mm]."""
-    is_local = degree is not None and uneven_light(pair, u, degree) > UNEVEN
+    is_local = degree is not None and uneven_light(pair, u, degree, LOCAL) > UNEVEN
     return LOCAL if is_local else degree
 
 

@@ -50,6 +50,7 @@ from modeharvest.idic.solver.noise import (
 )
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.solver.residual_test import ResidualTest, autocorrelation, lags_for
+from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
@@ -235,8 +236,13 @@ def with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, Flo
 
 
 def _goes_on(before: Result, ansatz: Ansatz, unknowns: FloatArray) -> bool:
-    """Whether the previous result can start this one: converged, with all waves observed now."""
+    """Whether the previous result can start this one: converged, with all waves observed now.
+
+    Free waves that weren't observable there have drifted anywhere.
+    """
     if before.outcome is not Outcome.CONVERGED or before.ansatz.fixed != ansatz.fixed:
+        return False
+    if not ansatz.fixed and identifiability(before).unobservable:
         return False
     return not shows_more(ansatz, unknowns, before.ansatz, before.unknowns)
 

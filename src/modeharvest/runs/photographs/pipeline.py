@@ -418,9 +418,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         out = result.outside_image / max(1, result.pixels + result.outside_image)
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
         if self._plain is None and out < 0.5:
-            degree = Brightness.of(case.correlation.brightness).degree
-            change = uneven_light(pair, result.displacement(), degree)
-            finer = 1 + (degree or 0)
+            degree = Brightness.of(case.correlation.brightness).degree or 0
+            change = uneven_light(pair, result.displacement(), degree, finer := degree + 1)
             left += (_UNEVEN.format(100 * change, finer, finer + 1),) * (change > UNEVEN)
         seen = geometry.mask & in_view(result, pair.grid.x, pair.grid.y) if left else geometry.mask
         return HarvestedFrame(
