@@ -23,7 +23,12 @@ from modeharvest.imaging.photographs.sequence import Video, natural, numbered, o
 from modeharvest.runs.measure import measure
 from modeharvest.runs.photographs.machine_log import LogTable, read_log
 from modeharvest.runs.photographs.pipeline import harvest
-from modeharvest.runs.photographs.sequence import ChosenFrames, FrameChoice, chosen_frames
+from modeharvest.runs.photographs.sequence import (
+    ChosenFrames,
+    FrameChoice,
+    chosen_frames,
+    named_files,
+)
 from modeharvest.util.errors import InputError, MissingDependencyError
 
 SHAPE = (48, 64)
@@ -71,6 +76,15 @@ def test_frame_2_comes_before_frame_10(tmp_path: Path) -> None:
     for name in ("shots", "shots/*.tif"):
         assert [path.stem for path in chosen(tmp_path, name).deformed] == expected
     assert sorted(["b10", "B9", "a"], key=natural) == ["a", "B9", "b10"]
+
+
+def test_folders_may_have_brackets_in_their_names(tmp_path: Path) -> None:
+    base = tmp_path / "Probe [3]"
+    base.mkdir()
+    folder_of(base / "shots [a]", ["f1", "f2"])
+    for name in ("shots [a]", "shots [a]/f1.tif", "shots*/f[1-2].tif"):
+        assert chosen(base, name).deformed[0] == base / "shots [a]/f1.tif"
+    assert len(named_files(Path(), [str(base / "shots [a]/f1.tif")])) == 1
 
 
 def test_the_reference_is_not_among_the_deformed(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from test_cli import called
 
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
@@ -65,7 +66,9 @@ def test_two_coarse_speckles_across_a_strip_suffice(tmp_path: Path, strain: floa
     assert np.median(np.linalg.norm(off, axis=1)) < 1.5
 
 
-def test_strains_are_along_the_specimens_own_axes(tmp_path: Path) -> None:
+def test_strains_are_along_the_specimens_own_axes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     axes = axes_of(12.0)
     strip(tmp_path, 12.0, axes.T @ STRETCH @ axes, width=90.0)
     (tmp_path / "gauges.toml").write_text(
@@ -88,6 +91,9 @@ def test_strains_are_along_the_specimens_own_axes(tmp_path: Path) -> None:
     assert read["A", "strain_22"] == pytest.approx(np.log(0.992), abs=1e-3)
     assert read["A", "strain_12"] == pytest.approx(0.0, abs=1e-3)
     assert ("L", "engineering_strain") in read
+    before = (tmp_path / "out/gauges.csv").read_text()
+    assert called(monkeypatch, "gauges", tmp_path / "out", tmp_path / "gauges.toml") == 0
+    assert (tmp_path / "out/gauges.csv").read_text() == before
     assert read["P", "strain_11"] < 0.0195  # its own angle counts
     assert "the specimen’s axis, 12° to x" in (tmp_path / "out/report.html").read_text("utf-8")
     with pytest.raises(InputError, match=r"--angle: expected .* got 192; the same axis is at 12$"):

@@ -40,6 +40,8 @@ class FinishedRun:
     """Photographs by image name, where there is one."""
     unit: str
     """Unit of lengths, "mm" or "px"."""
+    angle: float = 0.0
+    """Of the specimen's axis to x, along which the run's strains are [degrees]."""
 
     @classmethod
     def read(
@@ -62,10 +64,11 @@ class FinishedRun:
                 "expected a folder of 'measure', or of whole displacements of 'harvest' or 'run', "
                 f"or one of their files (HDF5), got {place}; 'harvest --whole-field' leaves them"
             )
-        files, images = {path.stem: path for path in paths}, []
+        files, images, angle = {path.stem: path for path in paths}, [], 0.0
         if (record := place / "summary.json").is_file():
-            listed = read_json(record)  # of measure, or of harvest
-            listed = listed.get("images") or listed.get("frames") or ()
+            summary = read_json(record)  # of measure, or of harvest
+            angle = float(summary.get("angle_deg") or 0.0)
+            listed = summary.get("images") or summary.get("frames") or ()
             images = [i for i in listed if i.get("name") in files]
             files = {i["name"]: files[i["name"]] for i in images} or files
         known = {name: place / "prepared" / f"{name}.tif" for name in files}
@@ -78,7 +81,8 @@ class FinishedRun:
         if paths[0].suffix == ".h5":
             with open_hdf5(paths[0], "a measured displacement (HDF5)") as file:
                 unit = str(file.attrs["unit"])
-        return cls(files, {n: p for n, p in known.items() if photographs or p.is_file()}, unit)
+        pictures = {n: p for n, p in known.items() if photographs or p.is_file()}
+        return cls(files, pictures, unit, angle)
 
     def result(self, name: str) -> NodalResult:
         """An image's displacement, with the roots of its covariance."""

@@ -58,7 +58,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
     )
     names = photograph_labels(shown)
     states = figures.photograph_states(harvest, names) if harvest else []
-    buckling, along = summary.get("buckling") or {}, _axis(summary)
+    buckling, along = summary.get("buckling") or {}, axis_text(summary.get("angle_deg", 0.0))
     panels = fits.panel_sections(
         _PANELED, photograph_panels(states), states,
         lambda key, s: (
@@ -335,10 +335,6 @@ def _timeline(harvest: Harvest, summary: Summary) -> Section:
     return Section.of("timeline", cards)
 
 
-def _axis(summary: Summary) -> str:
-    return axis_text(summary["experiment"]["specimen"].get("angle", 0.0))
-
-
 def _gauge_cards(summary: Summary, states: Sequence[PhotographState]) -> list[Card]:
     """Readings of gauges; their places, if the last photograph shown has a whole displacement."""
     rows, placed = summary.get("gauges", ()), None
@@ -348,7 +344,7 @@ def _gauge_cards(summary: Summary, states: Sequence[PhotographState]) -> list[Ca
     if rows and states and (whole := states[-1].frame.whole):
         image, gauges = states[-1].frame.image, states[-1].harvest.case.gauges
         placed = partial(draw_gauges_on, whole.measured, gauges, image / image.max(), "mm")
-    return gauge_cards(rows, strains, placed, _axis(summary))
+    return gauge_cards(rows, strains, placed, axis_text(summary.get("angle_deg", 0.0)))
 
 
 def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:

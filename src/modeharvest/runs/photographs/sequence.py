@@ -97,8 +97,8 @@ def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[
     """
     paths: list[Path] = []
     for name in names:
-        if any(sign in name for sign in "*?["):
-            matches = map(Path, glob.glob(str(base / name)))
+        if any(sign in name for sign in "*?[") and not (base / name).exists():
+            matches = (base / match for match in glob.glob(name, root_dir=base))
             found = sorted((p for p in matches if p.is_file()), key=natural)
             if not found:
                 raise InputError(f"expected files that match {base / name}, found none")
