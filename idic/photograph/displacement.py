@@ -92,6 +92,8 @@ the images match everywhere, or no better), and before the last measurement."""
 UNEVEN, _MOST = 0.02, 0.96
 """Range of the light's relative change over most of the material that polynomials may leave
 undescribed. Without any change, noise of 3 % in a strip of 360 x 40 px makes 0.012 of it."""
+_BY_CHANCE = 0.2
+"""That range by noise alone, at most, over the noise's share of the mean level."""
 LOCAL = "local"
 """Gain and offset from around each pixel, instead of a degree."""
 _SAMPLES, _LEAST = 100_000, 0.1
@@ -352,8 +354,12 @@ def uneven_light(pair: ImagePair, u: FloatArray, degree: int, finer: int | str) 
 
 def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> int | str | None:
     """The degree, or LOCAL if the light changed otherwise; ``u`` (rows, cols, 2) [mm]."""
-    is_local = degree is not None and uneven_light(pair, u, degree, LOCAL) > UNEVEN
-    return LOCAL if is_local else degree
+    if degree is None:
+        return None
+    images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
+    noise = np.linalg.norm([estimated_noise(image, mask).sd for image, mask in images])
+    chance = _BY_CHANCE * float(noise) / abs(float(pair.reference[pair.masks[0]].mean()))
+    return LOCAL if uneven_light(pair, u, degree, LOCAL) > max(UNEVEN, chance) else degree
 
 
 def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple[str, ...]:
