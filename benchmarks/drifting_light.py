@@ -46,7 +46,7 @@ CELLULAR = Box.centred(6 * PITCH, 8 * PITCH)
 DOMAIN = Box.centred(6 * PITCH + 1.6, 8 * PITCH + 1.6)
 STRAINS = (0.03, 0.05, 0.06, 0.07)
 FULL_SCALE = 255.0
-DEGREES = {"none": None, "0": 0, "1": 1, "2": 2}
+DEGREES: dict[str, int | str] = {"none": "none", "0": 0, "1": 1, "2": 2}
 
 Light = Callable[[int, FloatArray, FloatArray], tuple[FloatArray, float]]
 """Gain [-] and offset [grey levels] of photograph 1 to 4, at x and y from -1 to 1."""
@@ -67,17 +67,23 @@ def sloping(change: float, oblique: bool = False) -> Light:
     return light
 
 
-def spot(k: int, x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
-    """A spot of light, 20 % brighter than the rest, that moves."""
-    at = -0.6 + 0.3 * k
-    return 0.8 + 0.16 * np.exp(-((x - at) ** 2 + (y - 0.3) ** 2) / 0.18), 0.0
+def spot(size: float, share: float) -> Light:
+    """A spot of light that moves: its width (sd) over half an edge, and how much brighter it is."""
+
+    def light(k: int, x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
+        square = (x + 0.6 - 0.3 * k) ** 2 + (y - 0.3) ** 2
+        return 0.8 + 0.8 * share * np.exp(-0.5 * square / size**2), 0.0
+
+    return light
 
 
 LIGHTS: dict[str, Light] = {
     "even": uniform(1.0), "fades5": uniform(0.95), "fades20": uniform(0.8),
     "fades40": uniform(0.6), "rises40": uniform(0.7, 40.0), "sloping5": sloping(0.05),
     "sloping20": sloping(0.2), "sloping40": sloping(0.4), "oblique20": sloping(0.2, True),
-    "spot20": spot, "flicker20": lambda k, x, y: ((0.8, 1.0, 0.85, 0.95)[k - 1] + 0.0 * x, 0.0),
+    "spot20": spot(0.3, 0.2), "spot30": spot(0.3, 0.3), "small10": spot(0.2, 0.1),
+    "small20": spot(0.13, 0.2), "wide30": spot(0.5, 0.3),
+    "flicker20": lambda k, x, y: ((0.8, 1.0, 0.85, 0.95)[k - 1] + 0.0 * x, 0.0),
     "overexposed": lambda k, x, y: ((1.35 if k == 2 else 1.0) + 0.0 * x, 0.0),
 }  # fmt: skip
 
@@ -126,7 +132,7 @@ def photograph(strain: float, light: Light, number: int) -> FloatArray:
 
 
 def harvested(
-    folder: Path, light: Light, degree: int | None, whole: bool
+    folder: Path, light: Light, degree: int | str, whole: bool
 ) -> tuple[HarvestRun, float]:
     """Take the photographs and harvest them; processor seconds."""
     for k, strain in enumerate((0.0, *STRAINS)):
@@ -139,7 +145,7 @@ def harvested(
         f"[whole_field]\nmeasure = {str(whole).lower()}\n"
     )
     case, begin = PhotographCase.read(folder / "case.toml"), time.process_time()
-    how = replace(case.correlation, gain_degree=degree, offset_degree=degree)
+    how = replace(case.correlation, brightness=degree)
     run = HarvestRun(case.model_copy(update={"correlation": how}), folder / "out")
     run.results()
     return run, time.process_time() - begin

@@ -57,18 +57,12 @@ class AnsatzOptions:
     v0_degree: int = 5
     v_degree: int = 6
     """Total degrees of the Chebyshev polynomials of v0 and of every v_i."""
-    gain_degree: int | None = None
-    offset_degree: int | None = None
-    """Total degrees, 0 to 6, of gain and offset between the images' grey levels; None for none."""
+    brightness: int | str = "none"
+    """Total degree, 0 to 6, of gain and offset between the images' grey levels; or "none"."""
 
     def __post_init__(self) -> None:
         require_degrees(self.v0_degree, self.v_degree)
-        _ = self.brightness  # checks its degrees
-
-    @property
-    def brightness(self) -> Brightness:
-        """Gain and offset of the grey levels, as far as they are unknowns."""
-        return Brightness(self.gain_degree, self.offset_degree)
+        Brightness.of(self.brightness)  # checks it
 
 
 _Degrees = TypeVar("_Degrees", bound="AnsatzOptions | Ansatz")
@@ -131,7 +125,7 @@ class Ansatz:
             FourierMode.scaled(family, cell_size, Taper(cellular, 0.5 * cell_size))
             for family, cellular in families
         )
-        return cls(domain, modes, how.v0_degree, how.v_degree, how.brightness)
+        return cls(domain, modes, how.v0_degree, how.v_degree, Brightness.of(how.brightness))
 
     @classmethod
     def square(

@@ -8,6 +8,7 @@ offset c in f(x) = (1 + b(x)) g(x + u(x)) + c(x) are such fields.
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
@@ -151,12 +152,23 @@ class Brightness:
     """Total degree of c, in the same way."""
 
     def __post_init__(self) -> None:
-        for name, degree in self._each:
-            if degree is not None and not 0 <= degree <= 6:
+        for _, degree in self._each:
+            if degree is not None and not (isinstance(degree, int) and 0 <= degree <= 6):
                 raise InputError(
-                    f"brightness: expected a degree of the {name} from 0 to 6, or none, got "
-                    f"{degree}"
+                    "brightness: expected a degree of gain and offset, 0 (even) to 6, or 'none', "
+                    f"got {degree!r}"
                 )
+
+    @classmethod
+    def of(cls, degree: int | str) -> Brightness:
+        """Gain and offset of one degree, or neither if it is "none": as in options and cases."""
+        number: Any = None if degree == "none" else degree
+        return cls(number, number)
+
+    @property
+    def degree(self) -> int | None:
+        """The higher degree of both; None if there is neither."""
+        return max(self.degrees, default=None)
 
     @property
     def degrees(self) -> tuple[int, ...]:

@@ -68,10 +68,9 @@ class CorrelationOptions:
 class PhotographOptions(AnsatzOptions):
     """Table ``[correlation]`` of an experiment with photographs."""
 
-    gain_degree: int | None = 1
-    offset_degree: int | None = 1
-    """Total degrees, 0 to 6, of gain and offset between the images' grey levels; in Python None for
-    none. By default they may slope over the image (docs/decisions/0018-sloping-light.md)."""
+    brightness: int | str = 1
+    """Total degree, 0 to 6, of gain and offset between the images' grey levels; or "none". By
+    default they may slope over the image (docs/decisions/0018-sloping-light.md)."""
     family: str = "auto"
     """Mode family: "auto" reads the modes off the spectrum; "square" is the paper's Eq. (6)."""
     fixed_mode: bool | str = "auto"

@@ -250,9 +250,9 @@ def test_a_wrong_cell_size_is_contradicted(images: ImageSet) -> None:
 def test_options_are_what_the_ansatz_can_say() -> None:
     mask = holes_mask(GRID, PITCH * np.eye(2), 0.7, (PITCH / 2, PITCH / 2))
     local = sampled_field(patterned(GRID), GRID, mask, 2)
-    options = AnsatzOptions(2, 1, gain_degree=0)
+    options = AnsatzOptions(2, 1, brightness=0)
     ansatz = from_field(local, Box.centred(11.4, 15.2), options=options).ansatz
-    assert ansatz.size == 2 * 6 + 3 + 7 + 1
+    assert ansatz.size == 2 * 6 + 3 + 7 + 2
     assert ansatz.domain == Box(*GRID.extent)
 
 

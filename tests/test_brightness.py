@@ -100,5 +100,5 @@ def test_brightness_survives_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degrees", [(-1, None), (None, 7)])
 def test_bad_degrees(degrees: tuple[int | None, int | None]) -> None:
-    with pytest.raises(InputError, match="degree of the"):
+    with pytest.raises(InputError, match="degree of gain and offset"):
         Brightness(*degrees)

@@ -63,7 +63,7 @@ def test_the_options_that_are_off_in_the_paper_case_can_be_had(tmp_path: Path) -
     assert case.imaging.speckle.ink == Ink()
     assert isinstance(case.imaging.distortion, CameraDistortion)
     assert case.imaging.shape is not None
-    assert case.correlation.gain_degree is not None
+    assert case.correlation.brightness == "none"
 
 
 def test_materials_by_kind(tmp_path: Path) -> None:

@@ -168,7 +168,6 @@ def test_what_is_missing_is_one_line(
     [
         ("study noise --out x --workers two", "--workers: expected a valid integer, got 'two'."),
         ("measure a b --out x --pixel-size ?", "--pixel-size: expected a valid number, got '?'."),
-        ("measure a b --out x --brightness 0.5", "--brightness: expected a valid integer, got"),
         ("score a --truth x --strain big --out x", "--strain: expected a valid number, got 'big'."),
         ("score a --first-pixel one", "--first-pixel: expected a valid integer, got 'one'."),
         ("resolution a --first-pixel one", "--first-pixel: expected a valid integer, got 'one'."),

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
+from scipy.linalg import logm
 
 from modeharvest.idic.local.export import FORMATS, export_field
 from modeharvest.idic.local.field import LocalField, read_field
@@ -49,8 +51,95 @@ def test_codes_with_grids_want_whole_pixels(tmp_path: Path, form: str) -> None:
         export_field(tmp_path / "field", replace(FIELD, x=X + 0.01), form, GRID)
 
 
+def test_other_formats_hold_points_between_pixels(tmp_path: Path) -> None:
+    for form in set(FORMATS) - set(OF_GRIDS):
+        path = export_field(tmp_path / "field", replace(FIELD, x=X + 0.01), form, GRID)
+        np.testing.assert_allclose(read_field(path, GRID).x, X + 0.01, atol=1e-9)
+
+
 def test_millimetres_need_the_size_of_a_pixel(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected the size of a pixel for gom"):
         export_field(tmp_path / "field", FIELD, "gom", GRID, "px")
     with pytest.raises(InputError, match="expected a format among ncorr"):
         export_field(tmp_path / "field", FIELD, "vic", GRID)
+
+
+TURN, STRETCH = np.radians(20.0), np.array([[1.25, 0.1], [0.1, 0.8]])
+F = np.array([[np.cos(TURN), -np.sin(TURN)], [np.sin(TURN), np.cos(TURN)]]) @ STRETCH
+GREEN, HENCKY = 0.5 * (STRETCH @ STRETCH - np.eye(2)), logm(STRETCH)
+DOWN = np.array([[1.0, -1.0], [-1.0, 1.0]])
+"""Signs of a tensor's components where y points down."""
+
+
+def strained(form: str, folder: Path, unit: str = "mm") -> Path:
+    """A field of this rotation and stretch with a failed point, as a file of another code."""
+    same = np.ones((X.size, 1, 1))
+    tensors = {"F": same * F, "green_lagrange": same * GREEN, "logarithmic": same * HENCKY}
+    return export_field(folder / "field", FIELD, form, GRID, unit, tensors)
+
+
+def columns(path: Path, separator: str = ",") -> dict[str, np.ndarray]:
+    """Columns of a table as another program would read them; blanks are NaN."""
+    head, *rows = path.read_text().splitlines()
+    names = [name.strip().strip('"') for name in head.split(separator)]
+    table = [
+        [float(word.replace(",", ".") or "nan") for word in row.split(separator)] for row in rows
+    ]
+    return dict(zip(names, np.array(table).T, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("form", "names", "failed"),
+    [
+        ("vic2d", ("exx", "exy", "eyy"), 0.0),
+        ("dice", tuple(f"VSG_STRAIN_{ij}" for ij in ("XX", "XY", "YY")), 0.0),
+        ("matchid", tuple(f"strain.Strain-global frame: E{ij} [ ]" for ij in ("xx", "xy", "yy")),
+         np.nan),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("unit", ["mm", "px"])
+def test_green_s_strains_are_along_the_axes_of_the_image(
+    tmp_path: Path, form: str, names: tuple[str, ...], failed: float, unit: str
+) -> None:
+    table = columns(strained(form, tmp_path, unit))
+    E = DOWN * GREEN
+    for name, true in zip(names, (E[0, 0], E[0, 1], E[1, 1]), strict=True):
+        np.testing.assert_allclose(table[name][GOOD], true, rtol=1e-9)
+        np.testing.assert_equal(table[name][~GOOD], failed)
+
+
+def test_ncorr_s_grids_of_strains(tmp_path: Path) -> None:
+    saved = loadmat(strained("ncorr", tmp_path), simplify_cells=True)["data_dic_save"]
+    shown = saved["displacements"]["plot_u_ref_formatted"] != 0.0
+    for name, true in (("exx", GREEN[0, 0]), ("exy", -GREEN[0, 1]), ("eyy", GREEN[1, 1])):
+        grid = saved["strains"][f"plot_{name}_ref_formatted"]
+        np.testing.assert_allclose(grid[shown], true, rtol=1e-9)
+        assert not grid[~shown].any()
+
+
+def test_pyvale_s_strains_are_in_a_file_of_their_own(tmp_path: Path) -> None:
+    table = columns(strained("pyvale", tmp_path).with_name("strain_field.csv"))
+    for i in range(2):
+        for j in range(2):
+            np.testing.assert_allclose(table[f"def_grad_{i}{j}"][GOOD], (DOWN * F)[i, j])
+            np.testing.assert_allclose(table[f"eps_{i}{j}"][GOOD], (DOWN * HENCKY)[i, j])
+    np.testing.assert_allclose(table["window_x"], COL)
+
+
+@pytest.mark.parametrize(("form", "unit", "sign"), [
+    ("csv", "mm", 1.0), ("csv", "px", -1.0), ("npz", "mm", 1.0), ("mat", "px", -1.0)
+])  # fmt: skip
+def test_own_formats_hold_gradient_and_strains(
+    tmp_path: Path, form: str, unit: str, sign: float
+) -> None:
+    path = strained(form, tmp_path, unit)
+    read = {"csv": columns, "npz": np.load, "mat": loadmat}[form](path)
+    for name, true in (("F_yx", F[1, 0]), ("logarithmic_xy", HENCKY[0, 1])):
+        np.testing.assert_allclose(read[name].ravel()[GOOD], sign * true, rtol=1e-6)
+    field = read_field(path, GRID)
+    np.testing.assert_allclose(field.u[field.good], U[GOOD], atol=1e-9)
+
+
+def test_codes_without_columns_for_strains_get_none(tmp_path: Path) -> None:
+    assert [*columns(strained("gom", tmp_path), ";")][-1] == "displacement_z"
+    assert "exx" not in columns(export_field(tmp_path / "none", FIELD, "vic2d", GRID))

@@ -78,6 +78,12 @@ def test_a_run_written_for_another_code_is_read_as_it_was(
     true = 2.0 * np.column_stack([x, y]) @ (STRETCH - np.eye(2)).T
     np.testing.assert_allclose(u, true, atol=1e-9)
     assert len(x) > 400
+    if form == "vic2d":
+        F = np.eye(2) + 2.0 * (STRETCH - np.eye(2))
+        E = 0.5 * (F.T @ F - np.eye(2))
+        exx, eyy, exy = np.loadtxt(path, delimiter=",", skiprows=1).T[-3:]
+        for found, expected in ((exx, E[0, 0]), (eyy, E[1, 1]), (exy, -E[0, 1])):
+            np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_all_fields_go_into_every_format(run: Path, tmp_path: Path) -> None:
@@ -175,6 +181,13 @@ def test_a_harvest_without_whole_displacements_is_exported_by_its_modes(
         x, y, u = field.valid_points()
         np.testing.assert_allclose(u, ansatz.displacement_at(a, np.column_stack([x, y])), atol=1e-9)
         assert len(x) == mask[::5, ::5].sum()
+        if form == "vic2d":
+            exx = np.loadtxt(path, delimiter=",", skiprows=1)[:, 5]
+            points, step = np.column_stack([x, y]), np.array([1e-5, 0.0])
+            ahead, behind = (points + s * step + ansatz.displacement_at(a, points + s * step)
+                             for s in (1, -1))  # fmt: skip
+            stretch = np.linalg.norm(ahead - behind, axis=1) / 2e-5
+            np.testing.assert_allclose(exx, 0.5 * (stretch**2 - 1.0), atol=1e-6)
         if form == "csv":
             assert field.sd is not None
             assert field.sd.min() > 1e-5  # by model error

@@ -188,7 +188,7 @@ def test_the_updated_formulation_agrees_with_the_total_one(
         ("cell_size = 1.9", "cell_size = 2.3", "cell"),
         ("cell_size = 1.9", "cel_size = 1.9", "did you mean 'cell_size'"),
         ("frame_\\*.tif", "nothing_*.tif", "expected files that match"),
-        ("reference.tif", "no.tif", "found no file"),
+        ("reference.tif", "no.tif", "found no such file"),
         (f"pixel_size = {PIXEL}", "line = [[0, 0], [0, 0]]\nlength = 1.0", "two different ends"),
     ],
 )

@@ -11,7 +11,9 @@ from synthetic_photographs import Displacement, Photographed, lattice_points, of
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.modes import square_family
+from modeharvest.idic.modes import free_family, square_family
+from modeharvest.idic.photograph.measure import _goes_on
+from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
@@ -128,11 +130,14 @@ def test_light_that_changes_along_the_material_is_reported(tmp_path: Path) -> No
     shown.save(tmp_path, {"frame_1": truth(0.03)})
     light, frame = np.linspace(0.93, 1.0, shown.grid.cols), tmp_path / "frame_1.tif"
     tifffile.imwrite(frame, np.uint8(light * tifffile.imread(frame)))
-    even = "gain_degree = 0\noffset_degree = 0\n"
-    for name, more, count in (("even", even, 1), ("default", "", 0)):
+    none, even = 'brightness = "none"\n', "brightness = 0\n"
+    for name, more, count in (("none", none, 1), ("even", even, 1), ("default", "", 0)):
         (tmp_path / f"{name}.toml").write_text(experiment("total") + more)
         case = PhotographCase.read(tmp_path / f"{name}.toml")
-        (row,) = HarvestRun(case, tmp_path / name).harvest().numbers
+        run = HarvestRun(case, tmp_path / name)
+        (row,) = run.harvest().numbers
+        unknowns = [a for a in run.results()["frame_1"].result.ansatz.names if "gain" in a]
+        assert len(unknowns) == {"none": 0, "even": 1, "default": 3}[name]
         assert sum("light changed" in text for text in row["warnings"]) == count
 
 
@@ -150,3 +155,18 @@ def test_light_that_slopes_and_fades_is_not_taken_for_displacement(
     (measured,) = run.results().values()
     off = (measured.result.displacement() - truth(0.06)(shown.points))[shown.mask]
     assert np.sqrt(np.mean(off**2)) / PIXEL < 0.03
+
+
+def test_free_waves_that_were_not_observable_start_no_correlation() -> None:
+    """Before buckling they had drifted to (0.50, 0.36), where the next photographs stayed."""
+    domain = Box.centred(6 * PITCH, 5 * PITCH)
+    family = free_family([[1.0, -1.0, 1.0, 0.73, 0.0], [1.0, 1.0, -1.0, 0.73, 0.0]])
+    ansatz = Ansatz.on(domain, [(family, domain)], PITCH)
+    for size, goes_on in ((0.05, False), (20.0, True)):
+        a = ansatz.initial_guess(0.04, size)
+        covariance = 1e-8 * np.eye(ansatz.size)
+        before = Result(
+            ansatz, PixelGrid.centred(300, 300, PIXEL), a, covariance, 4.0, 90_000, 0,
+            Outcome.CONVERGED, 10.0, slope_square=100.0,
+        )  # fmt: skip
+        assert _goes_on(before, ansatz, a) == goes_on

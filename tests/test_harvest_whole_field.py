@@ -80,7 +80,7 @@ def experiment(
         f'[images]\nreference = "reference.tif"\ndeformed = ["{frames}"]\n'
         f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = {PITCH}\n"
         f"[correlation]\nv0_degree = 2\nv_degree = 1\nformulation = '{formulation}'\n"
-        f"gain_degree = 0\n{more}"
+        f"brightness = 0\n{more}"
     )
     return path
 

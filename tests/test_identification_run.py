@@ -461,7 +461,7 @@ def test_the_shipped_case_is_one() -> None:
         ({"data": {"fields": ["a.csv", "b.csv"], "field_sd_mm": 1.0, "distortion": "lens.json"}},
          "expected images for the distortion of a lens, got fields"),
         ({"data": {"reference": "f.tif", "deformed": ["g.tif", "h.tif"], "pixel_size": 0.1,
-                   "light_degree": 9}}, "data: expected light_degree of 0 to 6, got 9"),
+                   "brightness": 9}}, "0 (even) to 6, or 'none', got 9"),
         ({"twin": None}, "expected a table [data] or a table [twin]"),
         ({"data": {**FIELDS, "critical_strain": [0.08, 0.07]}},
          "expected critical_strain = [low, high] above 0, got [0.08, 0.07]"),

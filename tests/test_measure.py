@@ -36,9 +36,13 @@ from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.photograph.displacement import (
+    LOCAL,
+    UNEVEN,
     block_motion,
+    brightness,
     deformed_mask,
     displacement_from,
+    light_for,
     uneven_light,
 )
 from modeharvest.imaging.grid import PixelGrid
@@ -362,7 +366,7 @@ def test_what_does_not_match_is_reported(plate: Plate, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-@pytest.mark.parametrize(("share", "count"), [(0.01, 0), (0.03, 1)])
+@pytest.mark.parametrize(("share", "count"), [(0.005, 0), (0.03, 1)])
 def test_light_that_changes_along_the_material_is_reported(
     share: float, count: int, degree: int
 ) -> None:
@@ -372,11 +376,41 @@ def test_light_that_changes_along_the_material_is_reported(
     light = 1.0 + share * (across if degree == 0 else 3.0 * across**2)
     assert pair.truth is not None
     lit = pair.with_images(pair.reference, light * pair.deformed)
-    found = uneven_light(lit, pair.truth.displacement, degree)
-    assert len(found) == count
-    assert all(f"--brightness {degree + 1} or" in text for text in found)
+    u = pair.truth.displacement
+    assert (uneven_light(lit, u, degree, degree + 1) > UNEVEN) == bool(count)
+    assert light_for(lit, u, degree) == (LOCAL if count else degree)
+    assert light_for(lit, u, None) is None
     slope = pair.with_images(pair.reference, (1.0 + 0.05 * across) * pair.deformed)
-    assert not uneven_light(slope, pair.truth.displacement, 1)
+    assert light_for(slope, u, 1) == 1
+
+
+def test_gain_and_offset_around_each_pixel_are_those_of_a_spot() -> None:
+    """Also where the displacement is off by 2 px, and something hides the surface."""
+    pair, _ = plate_and_body()
+    assert pair.truth is not None
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    spot = 1.0 + 0.2 * np.exp(-((x - 0.5) ** 2 + y**2) / (2.0 * 0.6**2))
+    dark = 0.05 * pair.reference.std()
+    levels = spot * pair.deformed + dark
+    levels[100:120, 40:60] = levels.max()
+    for off_px, most in ((0.0, 0.015), (2.0, 0.04)):
+        u = pair.truth.displacement + off_px * GRID.pixel_size
+        gain, offset = brightness(pair.with_images(pair.reference, levels), u, LOCAL)
+        at = pair.truth.displacement[..., 0] + x, pair.truth.displacement[..., 1] + y
+        lit = 1.0 + 0.2 * np.exp(-((at[0] - 0.5) ** 2 + at[1] ** 2) / (2.0 * 0.6**2))
+        level = pair.reference[pair.masks[0]].mean()
+        found = ((level - offset) / gain)[pair.masks[0]]
+        error = found / (lit[pair.masks[0]] * level + dark) - 1.0
+        assert np.sqrt(np.mean(error**2)) < most
+
+
+@pytest.mark.parametrize(("size", "most"), [(0.5, 0.2), (0.8, 0.12)])
+def test_a_spot_of_light_is_not_taken_for_displacement(size: float, most: float) -> None:
+    """Of 20 % in the middle of the deformed image; linear gain and offset left 1.2 and 0.36 px."""
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    spot = 0.2 * np.exp(-((x - 0.6) ** 2 + (y + 0.2) ** 2) / (2.0 * size**2))
+    error = error_from(0.0, brightness=1, light=spot)
+    assert np.sqrt(np.mean(error**2)) < most
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
@@ -482,15 +516,18 @@ def test_error_bars_at_edges_count_the_start_s_noise(wave_px: float) -> None:
 
 
 def error_from(
-    off_px: float, wave_px: float = 60.0, brightness: int = 0, light: float = 0.0
+    off_px: float,
+    wave_px: float = 60.0,
+    brightness: int | None = 0,
+    light: float | np.ndarray = 0.0,
 ) -> np.ndarray:
     """(p, 2) errors on the plate [px], where nothing is known of the deformed image.
 
-    The start is off by a wave; the light grows along x in the deformed image by a share.
+    The start is off by a wave; the light in the deformed image grows by a share.
     """
     exact, body = plate_and_body()
-    mask, slope = exact.masks[0], 1.0 + light * GRID.x / GRID.x.max()
-    pair = ImagePair(255 * exact.reference, 255 * slope * exact.deformed, GRID, mask)
+    mask, lit = exact.masks[0], (1.0 + light) * exact.deformed
+    pair = ImagePair(255 * exact.reference, 255 * lit, GRID, mask)
     phase = 2.0 * np.pi / (wave_px * GRID.pixel_size) * body.mesh.nodes[:, ::-1]
     wave = off_px * GRID.pixel_size * np.column_stack([np.cos(phase[:, 0]), np.sin(phase[:, 1])])
     start = quadratic_field(body.mesh.nodes) + wave
@@ -536,12 +573,14 @@ def test_a_small_specimen_in_a_large_picture_is_found(half: tuple[float, float],
 
 
 def test_light_that_changes_along_the_image_does_not_enter_the_displacement() -> None:
-    without, ignored, found = (
+    slope = 0.05 * GRID.x / GRID.x.max()
+    without, ignored, found, around = (
         np.sqrt(np.mean(error_from(2.0, 60.0, degree, light) ** 2))
-        for degree, light in ((0, 0.0), (0, 0.05), (2, 0.05))
+        for degree, light in ((0, 0.0), (None, slope), (2, slope), (0, slope))
     )
     assert ignored > 3.0 * without
     assert found < 1.4 * without
+    assert around < 0.1 * ignored
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
@@ -553,6 +592,7 @@ def test_light_that_changes_along_the_image_does_not_enter_the_displacement() ->
         ("black mask", "expected a mask with material"),
         ("mask of NaN", "expected a mask of finite numbers"),
         ("pixel size", "expected a pixel size [mm] of 1e-09 to 1e+06, got 1e-300"),
+        ("brightness", "expected a degree of gain and offset, 0 (even) to 6, or 'none', got '0.5'"),
         ("mesh", "expected a mesh that covers the mask"),
         ("mesh beside", "expected a mesh on the image"),
         ("mesh twice", "expected elements that don't overlap"),
@@ -588,6 +628,7 @@ def test_bad_input_is_one_line(
         write_image(bad, np.ascontiguousarray(images[what]))
     options = ["--mask", bad if "mask" in what else plate.folder / "mask.tif"]
     options += ["--pixel-size", "1e-300"] if what == "pixel size" else []
+    options += ["--brightness", "0.5"] if what == "brightness" else []
     if what.startswith("mesh"):
         times = 2 if what == "mesh twice" else 1
         corners = np.array([[-0.9, 0.5, 0.0], [0.0, 0.5, 0.0], [-0.9, 0.8, 0.0]])
@@ -603,6 +644,7 @@ def test_bad_input_is_one_line(
     command = ["measure", plate.folder / "ref.tif", deformed, *options, "--out", tmp_path / "out"]
     assert called(monkeypatch, *command) == 2
     assert message in error_line(capsys)
+    assert what != "missing" or not (tmp_path / "out").exists()
 
 
 def test_a_folded_element_takes_no_other_s_material_from_the_deformed_image() -> None:

@@ -20,9 +20,15 @@ from modeharvest.idic.modes import square_family
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.photographs.sequence import Video, natural, numbered, odd_numbers, times_of
+from modeharvest.runs.measure import measure
 from modeharvest.runs.photographs.machine_log import LogTable, read_log
 from modeharvest.runs.photographs.pipeline import harvest
-from modeharvest.runs.photographs.sequence import ChosenFrames, FrameChoice, chosen_frames
+from modeharvest.runs.photographs.sequence import (
+    ChosenFrames,
+    FrameChoice,
+    chosen_frames,
+    named_files,
+)
 from modeharvest.util.errors import InputError, MissingDependencyError
 
 SHAPE = (48, 64)
@@ -57,6 +63,8 @@ def film(path: Path, count: int, rate: float = 4.0) -> Path:
 
 def chosen(base: Path, *names: str, log: LogTable | None = None, **choice: object) -> ChosenFrames:
     how = FrameChoice(**choice)  # type: ignore[arg-type]
+    if not (base / "ref.tif").exists():
+        write_image(base / "ref.tif", grey(10))
     return chosen_frames(base, "ref.tif", names, how, log or LogTable(), base / "out")
 
 
@@ -68,6 +76,15 @@ def test_frame_2_comes_before_frame_10(tmp_path: Path) -> None:
     for name in ("shots", "shots/*.tif"):
         assert [path.stem for path in chosen(tmp_path, name).deformed] == expected
     assert sorted(["b10", "B9", "a"], key=natural) == ["a", "B9", "b10"]
+
+
+def test_folders_may_have_brackets_in_their_names(tmp_path: Path) -> None:
+    base = tmp_path / "Probe [3]"
+    base.mkdir()
+    folder_of(base / "shots [a]", ["f1", "f2"])
+    for name in ("shots [a]", "shots [a]/f1.tif", "shots*/f[1-2].tif"):
+        assert chosen(base, name).deformed[0] == base / "shots [a]/f1.tif"
+    assert len(named_files(Path(), [str(base / "shots [a]/f1.tif")])) == 1
 
 
 def test_the_reference_is_not_among_the_deformed(tmp_path: Path) -> None:
@@ -94,6 +111,20 @@ def test_an_empty_folder_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "shots").mkdir()
     with pytest.raises(InputError, match="found none among its 0 entries"):
         chosen(tmp_path, "shots")
+
+
+def test_a_name_of_no_file_is_one_line_before_any_frame_is_written(tmp_path: Path) -> None:
+    for name in ("ref", "f1"):
+        write_image(tmp_path / f"{name}.tif", grey(10))
+    for names in (["f1.tif", "nothing.tif"], ["shots"]):
+        with pytest.raises(InputError, match=f"{names[-1]}, found no such file; check its name"):
+            chosen(tmp_path, *names)
+    video = film(tmp_path / "test.mp4", 3)
+    with pytest.raises(InputError, match="found no such file"):
+        chosen(tmp_path, video.name, "nothing.tif")
+    with pytest.raises(InputError, match="expected a file at no"):
+        measure(video, [video], tmp_path / "out", mask=Path("no.png"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_missing_and_repeated_numbers_are_reported() -> None:
@@ -336,7 +367,7 @@ def test_another_time_zone_is_found_and_reported(tmp_path: Path) -> None:
     found = chosen(tmp_path, "shots", log=LogTable("log.csv"))
     forces = [known["force_N"] for known in found.recorded.values()]
     assert forces == pytest.approx([0, 2.5, 5, 1007.5])
-    assert any("-2 h ahead" in note and "time zone" in note for note in found.notes)
+    assert any("2 h behind" in note and "time zone" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,9 @@ def test_a_fixed_mode_has_no_unknowns_and_is_the_ideal_one() -> None:
 
 
 def test_gain_and_offset_can_be_asked_for() -> None:
-    ansatz = SquareLatticeOptions(gain_degree=1, offset_degree=0).ansatz(Specimen())
-    assert ansatz.names[77:] == ("gain[0,0]", "gain[1,0]", "gain[0,1]", "offset[0,0]")
-    with pytest.raises(InputError, match="degree of the gain"):
-        SquareLatticeOptions(gain_degree=9)
+    ansatz = SquareLatticeOptions(brightness=1).ansatz(Specimen())
+    assert ansatz.names[77:81] == ("gain[0,0]", "gain[1,0]", "gain[0,1]", "offset[0,0]")
+    assert SquareLatticeOptions().ansatz(Specimen()).size == 77
+    for wrong in (9, -1, "linear"):
+        with pytest.raises(InputError, match=f"0 .even. to 6, or 'none', got {wrong!r}"):
+            SquareLatticeOptions(brightness=wrong)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from test_cli import called
 
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
@@ -24,8 +25,9 @@ def axes_of(turn: float) -> np.ndarray:
 
 
 def strip(
-    folder: Path, turn: float, stretch: np.ndarray, length: float = 360.0, width: float = 40.0
-) -> None:
+    folder: Path, turn: float, stretch: np.ndarray, length: float = 360.0, width: float = 40.0,
+    finer: float = 2.0,
+) -> None:  # fmt: skip
     """Photographs of a strip turned counter-clockwise [degrees], before and after its motion."""
     a = np.radians(turn)
     rows, cols = 140 + int(length * np.sin(a)), 60 + int(length * np.cos(a))
@@ -37,7 +39,7 @@ def strip(
         X = (now - n * SHIFT) @ np.linalg.inv(np.eye(2) + n * stretch).T
         along, across = np.moveaxis(X @ axes.T, -1, 0)
         shown = (abs(along) < length / 2) & (abs(across) < width / 2)
-        levels = 50.0 + 160.0 * speckle(-2 * X[..., 1] + rows / 2, 2 * X[..., 0] + cols / 2)
+        levels = 50.0 + 160.0 * speckle(-finer * X[..., 1] + rows / 2, finer * X[..., 0] + cols / 2)
         noise = 0.03 * 255 * np.random.default_rng(n).normal(size=levels.shape)
         levels = np.clip(np.rint(np.where(shown, levels, 20.0) + noise), 0, 255)
         tifffile.imwrite(folder / f"{name}.tif", levels.astype(np.uint8))
@@ -53,7 +55,20 @@ def test_a_strip_is_measured_wherever_it_points(tmp_path: Path, turn: float) -> 
     assert summary["images"][0]["warnings"] == []
 
 
-def test_strains_are_along_the_specimens_own_axes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("strain", [0.05, 0.15])
+def test_two_coarse_speckles_across_a_strip_suffice(tmp_path: Path, strain: float) -> None:
+    """Of 33 px; it was refused, because blocks of a single speckle were found anywhere."""
+    stretch = np.diag([strain, -0.45 * strain])
+    strip(tmp_path, 0.0, stretch, 600.0, 60.0, finer=0.4)
+    measure(tmp_path / "ref.tif", [str(tmp_path / "def.tif")], tmp_path / "out")
+    result = read_result(tmp_path / "out/results/def.h5")
+    off = result.displacement - (result.mesh.nodes @ stretch.T + SHIFT)
+    assert np.median(np.linalg.norm(off, axis=1)) < 1.5
+
+
+def test_strains_are_along_the_specimens_own_axes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     axes = axes_of(12.0)
     strip(tmp_path, 12.0, axes.T @ STRETCH @ axes, width=90.0)
     (tmp_path / "gauges.toml").write_text(
@@ -76,7 +91,10 @@ def test_strains_are_along_the_specimens_own_axes(tmp_path: Path) -> None:
     assert read["A", "strain_22"] == pytest.approx(np.log(0.992), abs=1e-3)
     assert read["A", "strain_12"] == pytest.approx(0.0, abs=1e-3)
     assert ("L", "engineering_strain") in read
+    before = (tmp_path / "out/gauges.csv").read_text()
+    assert called(monkeypatch, "gauges", tmp_path / "out", tmp_path / "gauges.toml") == 0
+    assert (tmp_path / "out/gauges.csv").read_text() == before
     assert read["P", "strain_11"] < 0.0195  # its own angle counts
     assert "the specimen’s axis, 12° to x" in (tmp_path / "out/report.html").read_text("utf-8")
-    with pytest.raises(InputError, match=r"expected an angle .* got 100"):
-        measure(*files, angle=100.0)
+    with pytest.raises(InputError, match=r"--angle: expected .* got 192; the same axis is at 12$"):
+        measure(*files, angle=192.0)

@@ -11,6 +11,9 @@ from manufactured import GRID
 
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.motion import fit_unknowns
+from modeharvest.idic.photograph.axes import turned_axes
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.validation.onset import ImageAmplitude, find_buckling, load_axis, mean_strain
 
@@ -62,3 +65,17 @@ def test_mean_strain_is_that_of_the_slow_field() -> None:
     along, across = mean_strain(replace(result, unknowns=a), Box.centred(2.0, 2.4))
     assert along == pytest.approx(0.037 * 1.0, rel=1e-12)
     assert across == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 12.0, -100.0])
+def test_mean_strain_is_along_the_specimens_own_axes(angle: float) -> None:
+    """A specimen at this angle is compressed by 4 % along its axis, widens by 1 %, and turns."""
+    axes, turn = turned_axes(angle), turned_axes(7.0)
+    F = turn @ axes.T @ np.diag([0.96, 1.01]) @ axes
+    ansatz, _, f, g = case()
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(0.0, 1.0))
+    x, y = (part.ravel() for part in np.meshgrid(GRID.x, GRID.y))
+    known = LocalField(x, y, np.column_stack([x, y]) @ (F - np.eye(2)).T)
+    a = fit_unknowns(ansatz, ansatz.initial_guess(0.0, 1.0), known, 1).coefficients
+    found = mean_strain(replace(result, unknowns=a), Box.centred(2.0, 2.4), angle)
+    assert found == pytest.approx((0.04, -0.01), abs=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,17 @@ def test_a_harvest_turns_the_specimen_back(run: HarvestRun, name: str) -> None:
     assert strain.has_pattern
 
 
+def test_its_strain_is_along_the_axis_in_the_case_without_measuring_again(run: HarvestRun) -> None:
+    before = {name: path.stat().st_mtime_ns for name in TURNS
+              for path in [run.folder / f"results/{name}.json"] if run.results()}  # fmt: skip
+    specimen = replace(run.case.specimen, angle=30.0)
+    again = HarvestRun(run.case.model_copy(update={"specimen": specimen}), run.folder)
+    expected = 1.0 - np.linalg.norm(np.diag([0.94, 1.0]) @ [np.cos(np.pi / 6), 0.5])
+    assert [m.strain for m in again.harvest().timeline] == pytest.approx([expected] * 2, abs=5e-4)
+    after = {name: (run.folder / f"results/{name}.json").stat().st_mtime_ns for name in TURNS}
+    assert after == before
+
+
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_measure_follows_it_and_skips_what_is_no_photograph_of_it(
     photographs: Path, tmp_path: Path
@@ -95,6 +107,7 @@ def test_measure_follows_it_and_skips_what_is_no_photograph_of_it(
         "f_03_white": np.where(whole > 12, 255, whole).astype(np.uint8),
         "f_04_noise": noise,
         "f_05_small": whole[:-10],
+        "f_07_half": np.where(np.arange(len(whole))[:, None] < 300, whole, 0),
         "f_10": whole,
         "f_11_other": Photographed(SHOWN.grid, DOMAIN, HOLES, 1.4, 8).image(),
     }.items():
@@ -105,7 +118,8 @@ def test_measure_follows_it_and_skips_what_is_no_photograph_of_it(
     reasons = {row["name"]: row["reason"] for row in summary["skipped"]}
     expected = {
         "f_02_dark": "black", "f_03_white": "saturated", "f_04_noise": "blank",
-        "f_05_small": "one size", "f_06_cut": "f_06_cut.tif", "f_11_other": "one surface",
+        "f_05_small": "one size", "f_07_half": "in its last 260 of 560 rows",
+        "f_06_cut": "f_06_cut.tif", "f_11_other": "one surface",
     }  # fmt: skip
     assert set(reasons) == set(expected)
     for name, word in expected.items():

@@ -264,7 +264,7 @@ class Design:
         """
         degrees, own, least = (setup.v0_degree, setup.v_degree), self.strain, self.critical
         if degrees not in self._known:
-            how = replace(self.correlation, gain_degree=None, offset_degree=None)
+            how = replace(self.correlation, brightness="none")
             how = replace(how, v0_degree=degrees[0], v_degree=degrees[1])
             ansatz, pattern = how.ansatz(self.specimen), self.options.pattern
             if pattern is not None or self.solution is None:

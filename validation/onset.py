@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.photograph.axes import strains_along
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import OBSERVABLE
 from modeharvest.util.arrays import FloatArray
@@ -51,11 +52,11 @@ class Buckling:
     """The result as text."""
 
 
-def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
-    """Mean nominal compression along x and y of a part of the specimen [-].
+def mean_strain(result: Result, cellular: Box, angle: float = 0.0) -> tuple[float, float]:
+    """Mean nominal compression of a part of the specimen along its axes [-].
 
-    The relative change of the distance between the mean positions of opposite edges, displaced by
-    v0. A rotation gives no strain.
+    By its mean deformation gradient: from the mean positions of opposite edges, displaced by v0. A
+    rotation gives no strain. ``angle``: from x to the first axis, counter-clockwise [degrees].
     """
     along = np.linspace(0.02, 0.98, 33)
     x_sides = np.array([cellular.x_min, cellular.x_max])
@@ -64,11 +65,9 @@ def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
     v0, a = result.ansatz.v0, result.unknowns
     moved = (v0(a, x_sides, y).mean(axis=0), v0(a, x, y_sides).mean(axis=1))
     apart = np.diag([np.ptp(x_sides), np.ptp(y_sides)])
-    (along_x, along_y) = (
-        1.0 - np.linalg.norm(edge + u[1] - u[0]) / edge.sum()
-        for edge, u in zip(apart, moved, strict=True)
-    )
-    return float(along_x), float(along_y)
+    edges = [edge + u[1] - u[0] for edge, u in zip(apart, moved, strict=True)]
+    along, across = -strains_along(np.column_stack(edges) / apart.diagonal(), angle)
+    return float(along), float(across)
 
 
 def load_axis(strains: FloatArray) -> int:

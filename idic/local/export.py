@@ -1,13 +1,14 @@
 """Displacement fields written as other DIC codes write them, to be read back by ``read_field``.
 
 Numbers are in the convention of the code: see ``formats``. Standard deviations are written where
-the code has a place for them, as one number for both components.
+the code has a place for them, as one number for both components; strains where it has columns for
+them, along the axes of the file, in the code's own measure. pyvale has a file of its own for these.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,15 @@ FORMATS = {"ncorr": ".mat", "vic2d": ".csv", "davis": ".txt", "dice": ".txt", "m
 """Suffix of each format, by the format's name in commands."""
 
 
+Tensors = Mapping[str, FloatArray]
+"""(n, 2, 2) tensors at the points of a field, x right and y up: "F", "green_lagrange" and
+"logarithmic" [-]."""
+
+
 def export_field(
-    path: Path | str, field: LocalField, form: str, grid: PixelGrid, unit: str = "mm"
-) -> Path:
+    path: Path | str, field: LocalField, form: str, grid: PixelGrid, unit: str = "mm",
+    tensors: Tensors | None = None,
+) -> Path:  # fmt: skip
     """Write a field as one of :data:`FORMATS`; returns the file, whose suffix is the format's.
 
     InputError for an unknown format, for points off whole pixels where the code has grids, and for
@@ -40,6 +47,7 @@ def export_field(
 
     grid : the pixels of the reference image.
     unit : unit of the field's lengths, "mm" or "px".
+    tensors : deformation gradient and strains at the points; none by default.
     """
     if form not in FORMATS:
         raise InputError(f"expected a format among {', '.join(FORMATS)}, got {form!r}")
@@ -47,24 +55,41 @@ def export_field(
         raise InputError("expected the size of a pixel for gom, in mm; give --pixel-size")
     path = Path(path).with_suffix(FORMATS[form])
     texts, in_px = layouts()["written"], f"{form}_px"
+    is_down = form != "gom" and not (form in ("csv", "mat", "npz") and unit == "mm")
+    strains = _components(tensors or {}, field, is_down)
+    numbers = _numbers(field, grid, strains)
     if form in texts:
         of_unit = in_px if unit == "px" and in_px in texts else form
-        _write_text(path, texts[of_unit], _numbers(field, grid))
+        _write_text(path, texts[of_unit], numbers)
+        if strains and f"{form}_strain" in texts:
+            beside = path.with_name(f"strain_{path.name}")
+            _write_text(beside, texts[f"{form}_strain"], numbers)
     elif form == "davis":
-        _write_davis(path, *_lattice(path, field, grid))
+        _write_davis(path, *_lattice(path, numbers, ("u", "v")))
     elif form in ("csv", "npz"):
-        write_field(path, field, grid if unit == "px" else None)
+        write_field(path, field, grid if unit == "px" else None, strains)
     else:
-        content = _of_ncorr(path, field, grid, unit)
-        if form == "mat":
-            columns = columns_of(field, grid if unit == "px" else None)
+        content: Mapping[str, object]
+        if form == "ncorr":
+            content = _of_ncorr(path, numbers, grid.pixel_size, unit)
+        else:
+            columns = columns_of(field, grid if unit == "px" else None) | strains
             content = {re.sub(r"\W+", "_", head).strip("_"): of for head, of in columns.items()}
         with atomic(path) as part:
             savemat(part, content, appendmat=False, do_compression=True, oned_as="column")
     return path
 
 
-def _numbers(field: LocalField, grid: PixelGrid) -> Columns:
+def _components(tensors: Tensors, field: LocalField, is_down: bool) -> Columns:
+    """Components "F_xx", ... of tensors, NaN at failed points; ``is_down``: along y downwards."""
+    sign = np.array([[1.0, -1.0], [-1.0, 1.0]]) if is_down else np.ones((2, 2))
+    return {
+        f"{name}_{'xy'[i]}{'xy'[j]}": np.where(field.good, sign[i, j] * tensor[:, i, j], np.nan)
+        for name, tensor in tensors.items() for i in range(2) for j in range(2)
+    }  # fmt: skip
+
+
+def _numbers(field: LocalField, grid: PixelGrid, strains: Columns) -> Columns:
     """Columns of all points; where a point failed u and v are NaN, and "u0" and the like are 0."""
     (row, col), size = grid.to_px(field.x, field.y), grid.pixel_size
     u, v = np.where(field.good, field.u.T, np.nan) / size
@@ -76,13 +101,14 @@ def _numbers(field: LocalField, grid: PixelGrid) -> Columns:
         "status": np.where(field.good, 4.0, 11.0), "v_up_mm": size * v,
     }  # fmt: skip
     both = ("col", "row", "u", "v")
-    own |= {f"{name}_mm": size * own[name] for name in both}
-    return own | {f"{name}0": np.nan_to_num(own[name]) for name in both}
+    own |= strains | {f"{name}_mm": size * own[name] for name in both}
+    return own | {f"{name}0": np.nan_to_num(own[name]) for name in (*both, *strains)}
 
 
 def _write_text(path: Path, layout: Mapping[str, Any], numbers: Columns) -> None:
     """Write a table: NaN is left empty; the decimal sign is a comma if semicolons separate."""
-    separator, heads = layout["separator"], layout["columns"]
+    separator, heads = layout["separator"], dict(layout["columns"])
+    heads |= {head: of for head, of in layout.get("strains", {}).items() if of in numbers}
     decimal = "," if separator == ";" else "."
     with atomic(path) as part, part.open("w", encoding="utf-8") as file:
         file.write(separator.join(heads) + "\n")
@@ -91,12 +117,11 @@ def _write_text(path: Path, layout: Mapping[str, Any], numbers: Columns) -> None
             file.write(line.replace(".", decimal) + "\n")
 
 
-def _lattice(path: Path, field: LocalField, grid: PixelGrid) -> tuple[int, FloatArray]:
-    """Spacing of the points [px]; (2, rows, cols) u and v (down) [px], 0 where there is no point.
+def _lattice(path: Path, numbers: Columns, names: Sequence[str]) -> tuple[int, FloatArray]:
+    """Spacing of the points [px]; maps (k, rows, cols) of columns, 0 where there is no point.
 
     The grids start at the first pixel, so that all points are whole spacings from it.
     """
-    numbers = _numbers(field, grid)
     places = np.stack([numbers["row"], numbers["col"]])
     whole = np.rint(places).astype(np.int64)
     off, step = float(np.abs(places - whole).max()), int(np.gcd.reduce(whole.ravel())) or 1
@@ -105,8 +130,8 @@ def _lattice(path: Path, field: LocalField, grid: PixelGrid) -> tuple[int, Float
             f"{path}: expected points at whole pixels of the image for a code that writes grids, "
             f"got them up to {off:.2g} px off; write VIC-2D's or DICe's"
         )
-    maps = np.zeros((2, *(1 + whole.max(axis=1) // step)))
-    maps[:, *(whole // step)] = numbers["u0"], numbers["v0"]
+    maps = np.zeros((len(names), *(1 + whole.max(axis=1) // step)))
+    maps[:, *(whole // step)] = [numbers[f"{name}0"] for name in names]
     return step, maps
 
 
@@ -119,10 +144,14 @@ def _write_davis(path: Path, step: int, maps: FloatArray) -> None:
         np.savetxt(part, table, "%.12g", "\t", header=head + '"pixel"', comments="")
 
 
-def _of_ncorr(path: Path, field: LocalField, grid: PixelGrid, unit: str) -> dict[str, object]:
-    step, maps = _lattice(path, field, grid)
-    frame = {f"plot_{name}_dic": values for name, values in zip("uv", maps, strict=True)}
-    frame |= {f"plot_{name}_ref_formatted": grid.pixel_size * values
-              for name, values in zip("uv", maps, strict=True)}  # fmt: skip
-    info = {"pixtounits": grid.pixel_size, "units": unit, "spacing": step - 1, "type": "regular"}
-    return {"data_dic_save": {"displacements": frame, "dispinfo": info}}
+def _of_ncorr(path: Path, numbers: Columns, pixel_size: float, unit: str) -> dict[str, object]:
+    strains = [f"green_lagrange_{ij}" for ij in ("xx", "xy", "yy") if "F_xx" in numbers]
+    step, (u, v, *maps) = _lattice(path, numbers, ["u", "v", *strains])
+    frame = {"plot_u_dic": u, "plot_v_dic": v, "plot_u_ref_formatted": pixel_size * u,
+             "plot_v_ref_formatted": pixel_size * v}  # fmt: skip
+    info = {"pixtounits": pixel_size, "units": unit, "spacing": step - 1, "type": "regular"}
+    own: dict[str, object] = {"displacements": frame, "dispinfo": info}
+    if strains:
+        own["strains"] = {f"plot_e{name[-2:]}_ref_formatted": values
+                          for name, values in zip(strains, maps, strict=True)}  # fmt: skip
+    return {"data_dic_save": own}

@@ -247,13 +247,15 @@ def read_field(
     return LocalField(x, y, u, ok, sd, source=Path(path).name, convention=text)
 
 
-def write_field(path: Path | str, field: LocalField, px: PixelGrid | None = None) -> None:
+def write_field(
+    path: Path | str, field: LocalField, px: PixelGrid | None = None, more: Table | None = None
+) -> None:
     """Write a field as CSV or NPZ, which :func:`read_field` reads without any options.
 
-    ``px``: the pixels, for columns in pixels, y down. InputError if the name does not end in .csv
-    or .npz.
+    ``px``: the pixels, for columns in pixels, y down; ``more``: columns (n,) beside it. InputError
+    if the name does not end in .csv or .npz.
     """
-    columns, suffix = columns_of(field, px), Path(path).suffix.lower()
+    columns, suffix = columns_of(field, px) | (more or {}), Path(path).suffix.lower()
     if suffix not in (".csv", ".npz"):
         raise InputError(f"expected a field to be written as .csv or .npz, got {path}")
     with atomic(path) as part:
@@ -261,7 +263,8 @@ def write_field(path: Path | str, field: LocalField, px: PixelGrid | None = None
             with open(part, "wb") as file:
                 np.savez(file, **columns)  # type: ignore[arg-type]
         else:
-            data, formats = np.column_stack([*columns.values()]), ["%.9g"] * 6 + ["%d"]
+            data = np.column_stack([*columns.values()])
+            formats = ["%d" if head == _WRITTEN[-1] else "%.9g" for head in columns]
             np.savetxt(part, data, formats, ",", header=",".join(columns), comments="")
 
 

@@ -20,6 +20,12 @@ from scipy.spatial import cKDTree
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.chebyshev import Box, ChebyshevField
 from modeharvest.idic.finite_element.equations.system import Body
+from modeharvest.idic.finite_element.local_light import (
+    ROUNDS,
+    UNLIKE,
+    WINDOW,
+    local_gain_and_offset,
+)
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
     coarse_displacement,
@@ -36,6 +42,7 @@ from modeharvest.idic.photograph.matching.blocks import (
     match_blocks,
     require_same_surface,
 )
+from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.idic.solver.noise import estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import smoothed
 from modeharvest.imaging.grid import PixelGrid
@@ -82,10 +89,13 @@ _MISFIT, _SLIGHT = 2.0, 0.03
 _OFF_PX, _AT_EDGE_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0), 1.0
 """Possible error of edges after blocks of speckle, one for each first measurement (repeated until
 the images match everywhere, or no better), and before the last measurement."""
-_UNLIKE, _ROUNDS = 4.5, 4
-"""Residual over its median, 3 standard deviations of noise, beyond which pixels don't match."""
-_UNEVEN = 0.03
-"""Range of the light's relative change over the material from which on it is reported."""
+UNEVEN, _MOST = 0.02, 0.96
+"""Range of the light's relative change over most of the material that polynomials may leave
+undescribed. Without any change, noise of 3 % in a strip of 360 x 40 px makes 0.012 of it."""
+_BY_CHANCE = 0.2
+"""That range by noise alone, at most, over the noise's share of the mean level."""
+LOCAL = "local"
+"""Gain and offset from around each pixel, instead of a degree."""
 _SAMPLES, _LEAST = 100_000, 0.1
 """Pixels from which brightness is fitted; least gain anywhere, over the mean."""
 
@@ -103,25 +113,26 @@ class _Swept(NamedTuple):
 
 def displacement_from(
     start: FloatArray, pair: ImagePair, body: Body, options: FiniteElementOptions = _LAST,
-    progress: Progress = silent, light_degree: int = 0,
+    progress: Progress = silent, light_degree: int | None = 0,
 ) -> NodalResult:  # fmt: skip
     """Measure a photograph's displacement on a mesh, from an initial guess (n, 2) at nodes [mm].
 
     ``pair``: with the mask of the reference; brightness may differ. InputError if the images don't
     overlap; and as for :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
-    ``light_degree``: of the polynomials by which gain and offset vary over the reference.
+    ``light_degree``: of the polynomials by which gain and offset vary over the reference, if these
+    describe the light; else it is taken from around each pixel. None for images of one brightness.
     """
     mesh = body.mesh
     is_sought = pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None
 
-    def seen(u: FloatArray, off_px: float, degree: int) -> ImagePair:
+    def seen(u: FloatArray, off_px: float, degree: int | str | None) -> ImagePair:
         """The images, equally bright, without what shows background if edges are off this much."""
         u = _unfolded(u, body, _SMOOTH_PX * pair.grid.pixel_size)
         pair_alike = alike(pair, mesh, u, degree)
         mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
         return replace(pair_alike, deformed_mask=mask)
 
-    def swept(degree: int) -> _Swept:
+    def swept(degree: int | str | None) -> _Swept:
         """Repeat the first measurement until the images match everywhere, or no better."""
         better, u, unknown = start, start, 0 if pair.deformed_mask is not None else len(start)
         for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
@@ -136,9 +147,12 @@ def displacement_from(
     first = swept(light_degree)
     if light_degree and first.unknown > _LOST * len(start):  # slopes adapt to a start far off
         first = min(first, swept(0), key=lambda each: each.unknown)
+    light = light_for(pair, _on_pixels(pair, mesh, first.u), light_degree)
+    if light == LOCAL:
+        first = swept(light)
     _, start, u = first
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
-    pair_alike = seen(u, _AT_EDGE_PX, light_degree)
+    pair_alike = seen(u, _AT_EDGE_PX, light)
     found = measured(pair_alike, start)
     if found.cutoff_px is None or found.cutoff_px < _SMOOTHER_FROM * _SMOOTH_PX:
         return found
@@ -267,22 +281,32 @@ def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) ->
     return inner if inner is not None and inner.any() else None
 
 
-def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int) -> ImagePair:
-    """Make brightness and contrast of the pair equal, in the reference's levels; u (n, 2) [mm]."""
+def _on_pixels(pair: ImagePair, mesh: Mesh, u: FloatArray) -> FloatArray:
+    """(rows, cols, 2) nodal displacement u (n, 2) at the pixels; NaN beside the mesh."""
     at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
-    gain, offset = brightness(pair, np.moveaxis(at, 0, -1), degree)
+    return np.moveaxis(at, 0, -1)
+
+
+def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int | str | None) -> ImagePair:
+    """Make brightness and contrast of the pair equal, in the reference's levels; u (n, 2) [mm]."""
+    gain, offset = brightness(pair, _on_pixels(pair, mesh, u), degree)
     a, b = (part[pair.masks[0]].mean() for part in (gain, offset))
     reference = a * (pair.reference - offset) / gain + b
     return pair.with_images(reference.astype(np.float32), a * pair.deformed + b)
 
 
-def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatArray, FloatArray]:
+def brightness(
+    pair: ImagePair, u: FloatArray, degree: int | str | None = 0
+) -> tuple[FloatArray, FloatArray]:
     """Gain [-] and offset [grey levels], (rows, cols), that make g(x + u) as bright as f.
 
     Polynomials of total degree ``degree`` that give both images the same mean and contrast: so a
     displacement that is off by some pixels hardly matters. Edges and pixels that don't match don't
-    count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known.
+    count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known. Degree None: neither, 1 and 0;
+    LOCAL: from mean and contrast around each pixel.
     """
+    if degree is None:
+        return np.ones(pair.grid.shape), np.zeros(pair.grid.shape)
     grid, inner = pair.grid, shrunk(pair.masks[0], _OFF_PX[0])
     inner = (inner if inner.any() else pair.masks[0]) & np.isfinite(u).all(axis=-1)
     every = max(1, int(inner.sum() / _SAMPLES))
@@ -290,10 +314,14 @@ def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatAr
     there = np.isfinite(both[:, 1])
     if not there.any() or not np.ptp(both[there, 1]) > 0.0:
         raise InputError("expected pixels of the material in both images, got none in common")
-    field = ChebyshevField(Box(*grid.x[[0, -1]], *grid.y[[-1, 0]]), degree)
     row, col = (places[::every] for places in np.nonzero(inner))
+    if degree == LOCAL:
+        width = WINDOW * speckle_size(pair.reference, pair.masks[0])
+        a, b = local_gain_and_offset(row, col, both, grid.shape, width)
+        return np.maximum(a, _LEAST * a[pair.masks[0]].mean()), b
+    field = ChebyshevField(Box(*grid.x[[0, -1]], *grid.y[[-1, 0]]), int(degree))
     basis = field.basis(grid.x[col], grid.y[row])
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         within = basis[there]
         mean = within @ np.linalg.lstsq(within, both[there])[0]
         f, g = np.abs(both[there] - mean).T
@@ -301,12 +329,12 @@ def brightness(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[FloatAr
         left = both[:, 0] - basis @ gain * both[:, 1]
         offset = np.linalg.lstsq(within, left[there])[0]
         off = np.abs(left - basis @ offset)
-        there = off <= _UNLIKE * np.nanmedian(off)
+        there = off <= UNLIKE * np.nanmedian(off)
     a, b = (field.evaluate(part, grid.x[None], grid.y[:, None]) for part in (gain, offset))
     return np.maximum(a, _LEAST * a[pair.masks[0]].mean()), b
 
 
-def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
+def residual(pair: ImagePair, u: FloatArray, degree: int | str | None = 0) -> FloatArray:
     """(rows, cols) f - gain g(x + u) - offset [grey levels]; NaN outside material and image."""
     gain, offset = brightness(pair, u, degree)
     known = pair.masks[0] & np.isfinite(u).all(axis=-1)
@@ -316,21 +344,27 @@ def residual(pair: ImagePair, u: FloatArray, degree: int = 0) -> FloatArray:
     return found
 
 
-def uneven_light(pair: ImagePair, u: FloatArray, degree: int = 0) -> tuple[str, ...]:
-    """Warn if the light changed over the material otherwise than by polynomials of a degree.
+def uneven_light(pair: ImagePair, u: FloatArray, degree: int, finer: int | str) -> float:
+    """Range of the light's relative change over the material that a degree doesn't describe [-].
 
-    ``u`` (rows, cols, 2) [mm].
+    ``u`` (rows, cols, 2) [mm]; ``finer``: what describes it, another degree, or LOCAL where u is
+    near the truth everywhere.
     """
     mask, typical = pair.masks[0], float(pair.reference[pair.masks[0]].mean())
-    maps = (brightness(pair, u, of) for of in (degree, degree + 1))
-    level, finer = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
-    change = float(np.ptp(finer - level) / abs(finer.mean()))
-    text = (
-        f"The light changed along the material, by {100 * change:.0f} %, which is taken for "
-        f"displacement: measure with --brightness {degree + 1} or {degree + 2}, harvest with "
-        f"gain_degree {degree + 1} or {degree + 2}."
-    )
-    return (text,) * (change > _UNEVEN)
+    maps = (brightness(pair, u, each) for each in (degree, finer))
+    level, around = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
+    low, high = np.quantile(around - level, [0.5 - 0.5 * _MOST, 0.5 + 0.5 * _MOST])
+    return float((high - low) / abs(around.mean()))
+
+
+def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> int | str | None:
+    """The degree, or LOCAL if the light changed otherwise; ``u`` (rows, cols, 2) [mm]."""
+    if degree is None:
+        return None
+    images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
+    noise = np.linalg.norm([estimated_noise(image, mask).sd for image, mask in images])
+    chance = _BY_CHANCE * float(noise) / abs(float(pair.reference[pair.masks[0]].mean()))
+    return LOCAL if uneven_light(pair, u, degree, LOCAL) > max(UNEVEN, chance) else degree
 
 
 def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple[str, ...]:

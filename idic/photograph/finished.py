@@ -12,6 +12,7 @@ import numpy as np
 from scipy.io import savemat
 
 from modeharvest.idic.finite_element import files as nodal
+from modeharvest.idic.finite_element.fields import field_of, nodal_gradient
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.export import export_field
 from modeharvest.idic.local.field import LocalField
@@ -39,6 +40,8 @@ class FinishedRun:
     """Photographs by image name, where there is one."""
     unit: str
     """Unit of lengths, "mm" or "px"."""
+    angle: float = 0.0
+    """Of the specimen's axis to x, along which the run's strains are [degrees]."""
 
     @classmethod
     def read(
@@ -61,10 +64,11 @@ class FinishedRun:
                 "expected a folder of 'measure', or of whole displacements of 'harvest' or 'run', "
                 f"or one of their files (HDF5), got {place}; 'harvest --whole-field' leaves them"
             )
-        files, images = {path.stem: path for path in paths}, []
+        files, images, angle = {path.stem: path for path in paths}, [], 0.0
         if (record := place / "summary.json").is_file():
-            listed = read_json(record)  # of measure, or of harvest
-            listed = listed.get("images") or listed.get("frames") or ()
+            summary = read_json(record)  # of measure, or of harvest
+            angle = float(summary.get("angle_deg") or 0.0)
+            listed = summary.get("images") or summary.get("frames") or ()
             images = [i for i in listed if i.get("name") in files]
             files = {i["name"]: files[i["name"]] for i in images} or files
         known = {name: place / "prepared" / f"{name}.tif" for name in files}
@@ -77,7 +81,8 @@ class FinishedRun:
         if paths[0].suffix == ".h5":
             with open_hdf5(paths[0], "a measured displacement (HDF5)") as file:
                 unit = str(file.attrs["unit"])
-        return cls(files, {n: p for n, p in known.items() if photographs or p.is_file()}, unit)
+        pictures = {n: p for n, p in known.items() if photographs or p.is_file()}
+        return cls(files, pictures, unit, angle)
 
     def result(self, name: str) -> NodalResult:
         """An image's displacement, with the roots of its covariance."""
@@ -119,7 +124,8 @@ class FinishedRun:
                     raise InputError(f"expected whole displacements for {form}, {_MODES_ALONE}")
                 found = Result.read(file)
                 field = at_pixels_of_modes(found, _mask_of(file.parent.parent), step)
-                written.append(export_field(f"{path}.x", field, form, found.grid))
+                strains = _tensors(_gradient_of_modes(found, field.points))
+                written.append(export_field(f"{path}.x", field, form, found.grid, tensors=strains))
                 continue
             result = self.result(name)
             if form in _WHOLE and pixel_size is None:
@@ -135,10 +141,12 @@ class FinishedRun:
                     savemat(part, maps, appendmat=False, do_compression=True)
             else:
                 field, grid, unit = at_pixels(result, step), result.grid, self.unit
+                slopes = nodal_gradient(result.mesh, result.displacement)
+                strains = _tensors(result.at(field.points, slopes))
                 if pixel_size is not None:
                     grid, unit = PixelGrid.centred(*grid.shape, pixel_size), "mm"
                     field = field.scaled(pixel_size)
-                written.append(export_field(f"{path}.x", field, form, grid, unit))
+                written.append(export_field(f"{path}.x", field, form, grid, unit, strains))
         return written
 
     def _maps(self, result: NodalResult, step: int) -> dict[str, FloatArray]:
@@ -152,6 +160,7 @@ class FinishedRun:
         return maps
 
 
+_STEP_PX = 1e-3
 _MODES_ALONE = "got v0 and v1 phi1 alone; harvest with --whole-field, or choose another format"
 _WHOLE: dict[str, tuple[str, Callable[..., None]]] = {
     "csv": (".csv", nodal.write_csv), "hdf5": (".h5", nodal.write_result),
@@ -196,6 +205,24 @@ def at_pixels_of_modes(result: Result, mask: BoolArray, step: int) -> LocalField
     return LocalField(
         table[:, 0], table[:, 1], table[:, 2:4], sd=None if known is None else table[:, 4:]
     )
+
+
+def _gradient_of_modes(result: Result, points: FloatArray) -> FloatArray:
+    """(n, 2, 2) gradient of v0 and v1 phi1 at points [mm], by central differences."""
+    steps = _STEP_PX * result.grid.pixel_size * np.eye(2)
+    ahead, behind = (
+        np.stack(
+            [result.ansatz.displacement_at(result.unknowns, points + s * h) for h in steps], -1
+        )
+        for s in (1, -1)
+    )
+    return np.asarray((ahead - behind) / (2.0 * steps[0, 0]))
+
+
+def _tensors(gradient: FloatArray) -> dict[str, FloatArray]:
+    """The tensors that exports may hold, from displacement gradients (n, 2, 2)."""
+    F = np.eye(2) + gradient
+    return {name: field_of(name, F) for name in ("F", "green_lagrange", "logarithmic")}
 
 
 def _mask_of(folder: Path) -> BoolArray:

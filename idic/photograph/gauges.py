@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +20,7 @@ from skimage.measure import points_in_poly
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.fields import field_of, nodal_gradient
 from modeharvest.idic.finite_element.result import NodalResult, located
+from modeharvest.idic.photograph.axes import require_angle, turned_axes
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -61,10 +62,10 @@ class Gauge:
             raise InputError(f"{what} one of {', '.join(names)}, got {got}")
         if self.polygon is not None and len(self.polygon) < 3:
             raise InputError(f"{what} 3 corners or more, got {len(self.polygon)}")
-        if self.angle is not None and (self.line is not None or not abs(self.angle) <= 180.0):
-            raise InputError(
-                f"{what} an angle of -180 to 180 degrees, of a point or a polygon, got {self.angle}"
-            )
+        if self.angle is not None:
+            require_angle(f"gauge {self.name!r}: angle", self.angle)
+            if self.line is not None:
+                raise InputError(f"{what} an angle for a point or a polygon, got a line; omit it")
         if self.line is not None and self.line[0] == self.line[1]:
             raise InputError(f"{what} a line of some length, got none")
 
@@ -107,6 +108,12 @@ def distinct(gauges: Iterable[Gauge]) -> tuple[Gauge, ...]:
     return found
 
 
+def along_axes(gauges: Iterable[Gauge], angle: float) -> tuple[Gauge, ...]:
+    """Gauges that read along a specimen's axes, where they have no angle; unchanged if it is 0."""
+    return tuple(replace(g, angle=angle) if angle and g.angle is None and not g.line else g
+                 for g in gauges)  # fmt: skip
+
+
 def read_at(gauge: Gauge, result: NodalResult, unit: str = "mm") -> Readings:
     """Read a gauge in a displacement, with standard deviations (NaN if that has no roots).
 
@@ -146,12 +153,6 @@ def _mean(points: FloatArray, u: FloatArray, F: FloatArray) -> FloatArray:
     strain = field_of("logarithmic", F).mean(axis=0)
     others = [field_of(name, F).mean() for name in ("rotation", "stretch_1", "stretch_2", "J")]
     return np.array([*u.mean(axis=0), strain[0, 0], strain[1, 1], strain[0, 1], *others])
-
-
-def turned_axes(angle: float) -> FloatArray:
-    """(2, 2) axes as rows, turned counter-clockwise from x and y [degrees]."""
-    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-    return np.array([[c, s], [-s, c]])
 
 
 def _of_line(points: FloatArray, u: FloatArray, F: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from skimage.draw import polygon2mask
 
 from modeharvest.idic.ansatz import FEWEST_CELLS, cells_across
 from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.photograph.axes import require_angle
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape
@@ -77,6 +78,9 @@ class SpecimenTable:
     """Mask images of the material in the deformed images, in order; names may hold wildcards."""
     regions: tuple[RegionTable, ...] = ()
     """Parts of the cellular part whose patterns differ; by default it has one pattern."""
+    angle: float = 0.0
+    """From x to the specimen's axis, counter-clockwise [degrees]: mean strains, and those of gauges
+    without an angle, are along it."""
 
     def __post_init__(self) -> None:
         if not self.cell_size > 0:
@@ -91,6 +95,7 @@ class SpecimenTable:
                 f"specimen: expected a polygon or a mask image 'cells', got both, cells = "
                 f"{self.cells!r}"
             )
+        require_angle("specimen.angle", self.angle)
         names = [region.name for region in self.regions]
         if len(set(names)) < len(names):
             raise InputError(f"specimen.regions: expected different names, got {', '.join(names)}")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz, for_cells
+from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.correlate import ASTRAY, correlate
 from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
@@ -49,6 +50,7 @@ from modeharvest.idic.solver.noise import (
 )
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.solver.residual_test import ResidualTest, autocorrelation, lags_for
+from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
@@ -178,7 +180,7 @@ def measure_whole(
         start, normalised = "blocks of the speckle", pair
         slow, _ = first_motion(geometry.region.domain, pair, first.local)
         begin = block_motion(pair, body, slow(mesh.nodes))
-    light = max(how.brightness.degrees, default=0)
+    light = Brightness.of(how.brightness).degree or 0
     measured = displacement_from(begin, normalised, body, on_mesh, progress, light)
     noise = image_noise(pair, camera)
     expected = float(np.hypot(noise.reference, noise.deformed))
@@ -226,7 +228,7 @@ def found_modes(
 
 def with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
     """Ansatz and unknowns of a result with the specified brightness, as an initial guess."""
-    ansatz = replace(result.ansatz, brightness=how.brightness)
+    ansatz = replace(result.ansatz, brightness=Brightness.of(how.brightness))
     first = result.ansatz.phi_offset(len(result.ansatz.modes))
     start = np.zeros(ansatz.size)
     start[:first] = result.unknowns[:first]
@@ -234,8 +236,13 @@ def with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, Flo
 
 
 def _goes_on(before: Result, ansatz: Ansatz, unknowns: FloatArray) -> bool:
-    """Whether the previous result can start this one: converged, with all waves observed now."""
+    """Whether the previous result can start this one: converged, with all waves observed now.
+
+    Free waves that weren't observable there have drifted anywhere.
+    """
     if before.outcome is not Outcome.CONVERGED or before.ansatz.fixed != ansatz.fixed:
+        return False
+    if not ansatz.fixed and identifiability(before).unobservable:
         return False
     return not shows_more(ansatz, unknowns, before.ansatz, before.unknowns)
 

@@ -22,6 +22,8 @@ MOSTLY = 0.5
 """Share of saturated or of black material above which a photograph is refused."""
 MANY = 0.01
 """Share of saturated or of black material above which a note is added."""
+_BROKEN_OFF = 0.2
+"""Share of rows without any noise at the end above which a photograph is refused."""
 _BITS = (8, 10, 12, 14, 16)
 _NOISE_ONLY = 0.1
 """Correlation of neighbouring pixels below which there is no speckle. Speckle of 3 px has
@@ -143,7 +145,10 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
 
 
 def require_alike(reference: Photograph, frame: Photograph) -> Photograph:
-    """The frame with the reference's full scale; InputError if size or bit depth differ."""
+    """The frame with the reference's full scale; InputError if it differs in kind or is broken off.
+
+    Size and bit depth have to be the same.
+    """
     files.require_same_shape(reference.image, frame.image, str(reference.path), str(frame.path))
     other = _other_depth(reference, frame)
     if other:
@@ -151,9 +156,24 @@ def require_alike(reference: Photograph, frame: Photograph) -> Photograph:
             f"expected photographs of one bit depth, got {_depth(reference)} in {reference.path} "
             f"and {_depth(frame)} in {frame.path}{other}; export them alike"
         )
+    if (lost := _rows_lost(reference.image, frame.image)) > _BROKEN_OFF * len(frame.image):
+        raise InputError(
+            f"expected a whole photograph at {frame.path}, got one grey level in its last {lost} "
+            f"of {len(frame.image)} rows, where the camera or the copy broke off; take it again"
+        )
     bits = max(reference.bits, frame.bits)
     is_alike = frame.bits in (0, bits)  # else the frame is darker and fills fewer bits
     return frame if is_alike else replace(frame, bits=bits, full_scale=float(2**bits - 1))
+
+
+def _rows_lost(reference: FloatImage, frame: FloatImage) -> int:
+    """Number of the frame's last rows that have exactly one grey level, but not in the reference.
+
+    Even a black background has noise, unless it is clipped, and then in both.
+    """
+    is_lost = (np.ptp(frame, axis=1) == 0.0) & (frame[:, 0] == frame[-1, 0])
+    last = int(np.argmin(is_lost[::-1])) if not is_lost.all() else len(is_lost)
+    return int((np.ptp(reference[len(frame) - last :], axis=1) > 0.0).sum())
 
 
 def read_reference(path: Path | str, mask: BoolArray | None = None) -> Photograph:

@@ -205,7 +205,7 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
     def require(self, correlation: SquareLatticeOptions) -> None:
         """Require a free mode, exact images, and no unknown gain or offset."""
         super().require(correlation)
-        if correlation.camera or correlation.brightness.size:
+        if correlation.camera or correlation.brightness != "none":
             raise InputError(
                 "study: expected correlation.camera = false and neither gain nor offset, got "
                 "others: waves are measured in exact images"

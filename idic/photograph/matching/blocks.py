@@ -17,6 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from modeharvest.idic.local.field import LocalField, field_between
 from modeharvest.idic.local.motion import Slow
+from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
@@ -39,6 +40,9 @@ def expected_by(displacement: Slow, grid: PixelGrid) -> Expected:
 
 BLOCKS, BLOCK_PX, SMALLEST_PX = 120, 41, 15
 """Approximate number of blocks, and their edge, smaller where ligaments are too narrow for it."""
+_SPECKLES, _FEWEST, _WIDE = 3.0, 1.5, 0.8
+"""Edge of a block over a coarse speckle's size, or least edge where ligaments are narrow; share of
+the largest room on the material that this may take: one speckle is found anywhere."""
 REACH_PX = 24
 """Largest distance of a block from where it is expected, along rows and along columns."""
 TURNS_DEG = (0.0, -12.0, 12.0, -24.0, 24.0)
@@ -108,7 +112,7 @@ def match_blocks(
     count : Approximate number of blocks that a whole image would hold.
     """
     f, g = pair.reference, pair.deformed
-    centres, half = _blocks(pair.masks[0], count)
+    centres, half = _blocks(pair.masks[0], count, speckle_size(f, pair.masks[0]))
     aims = np.rint(expected(centres.astype(np.float64)))
     inside = ((aims >= half) & (aims < np.array(f.shape) - half)).all(axis=1)
     centres, aims = centres[inside], aims[inside].astype(np.int64)
@@ -148,7 +152,7 @@ def require_same_surface(
         )
 
 
-def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
+def _blocks(material: BoolArray, count: int, speckle_px: float) -> tuple[NDArray[np.int64], int]:
     """(centres (n, 2), half an edge) of blocks on material, spread over the image."""
     room = room_around(material)
     cell = max(8, int(np.sqrt(min(material.size, material.sum() / _SPARSE) / count)))
@@ -157,7 +161,10 @@ def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
     flat = tiles.reshape(rows, cols, -1)
     widest, where = flat.max(axis=-1), flat.argmax(axis=-1)
     half = int(np.quantile(widest[widest > 0], 0.5)) - 1 if widest.any() else 0
-    half = min(BLOCK_PX // 2, max(half, SMALLEST_PX // 2))
+    least = SMALLEST_PX // 2
+    if speckle_px > SMALLEST_PX:
+        least = max(least, int(min(0.5 * _FEWEST * speckle_px, _WIDE * widest.max(initial=0))))
+    half = min(max(BLOCK_PX, int(_SPECKLES * speckle_px)) // 2, max(half, least))
     if widest.max(initial=0) <= half:
         raise InputError(
             f"expected room for blocks of {SMALLEST_PX} px on the material, got ligaments "

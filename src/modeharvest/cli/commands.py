@@ -263,8 +263,8 @@ def measure(
         Path | None, typer.Option(help="Mesh of triangles: origin in the image's middle, y up.")
     ] = None,
     brightness: Annotated[
-        int, typer.Option(help="Degree of the polynomials of gain and offset over x, y: 0 to 6.")
-    ] = 1,
+        str, typer.Option(help="Degree of gain and offset over x, y: 0 to 6, or none.", metavar="N")
+    ] = "1",
     every: Annotated[int, typer.Option(help="Measure only every N-th image.", metavar="N")] = 1,
     log: Annotated[
         Path | None, typer.Option(help="Log file of the testing machine, joined to images by time.")
@@ -292,10 +292,11 @@ def measure(
     from modeharvest.runs.photographs.machine_log import LogTable
     from modeharvest.runs.photographs.sequence import FrameChoice
 
+    light = int(brightness) if brightness.isdecimal() else brightness
     with bars() as progress:
         summary = measure_images(
             reference, deformed, out, mask=mask, pixel_size=pixel_size, mesh=mesh,
-            brightness=brightness, choice=FrameChoice(every=every),
+            brightness=light, choice=FrameChoice(every=every),
             log=None if log is None else LogTable(str(log)), gauges=gauges, angle=angle,
             progress=progress,
         )  # fmt: skip

@@ -62,10 +62,11 @@ def gauges(
 ) -> None:
     """Read gauges in every image of a run: DIR/gauges.csv, gauges_along.csv, gauges.pdf."""
     from modeharvest.idic.photograph.finished import FinishedRun
-    from modeharvest.idic.photograph.gauges import read_gauges, write_gauges
+    from modeharvest.idic.photograph.gauges import along_axes, read_gauges, write_gauges
     from modeharvest.report.figures.on_photographs import draw_gauge, write_pdf
 
-    finished, wanted = FinishedRun.read(run), read_gauges(file)
+    finished = FinishedRun.read(run)
+    wanted = along_axes(read_gauges(file), finished.angle)
     out = run if run.is_dir() else run.parent
     each = ((name, finished.result(name)) for name in finished.files)
     read = write_gauges(out, wanted, each, finished.unit)

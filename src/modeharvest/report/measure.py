@@ -14,7 +14,7 @@ from modeharvest.idic.photograph.gauges import Gauge
 from modeharvest.report.explore import explored_images
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field, draw_image
-from modeharvest.report.figures.on_photographs import draw_gauges_on, gauge_cards
+from modeharvest.report.figures.on_photographs import axis_text, draw_gauges_on, gauge_cards
 from modeharvest.report.figures.sequence import force_cards
 from modeharvest.report.model.content import (
     Card,
@@ -57,8 +57,7 @@ def measure_report(
                 _cards(k, names[k], results, residual, picture, summary["unit"]))
         for k in shown
     ] if results and residual and picture else []  # fmt: skip
-    angle = summary.get("angle_deg", 0.0)
-    along = f"the specimen’s axis, {angle:g}° to x" if angle else "x"
+    along = axis_text(summary.get("angle_deg", 0.0))
     strains, placed = {image["name"]: image["strain_x"] for image in images}, None
     if gauges and results and picture:
         shown_on = results[names[-1]], gauges, picture(names[-1]), summary["unit"]

@@ -15,7 +15,7 @@ from modeharvest.report.explore import explored_photographs
 from modeharvest.report.figures import fits
 from modeharvest.report.figures import photographs as figures
 from modeharvest.report.figures.curves import draw_onset, draw_waves
-from modeharvest.report.figures.on_photographs import draw_gauges_on, gauge_cards
+from modeharvest.report.figures.on_photographs import axis_text, draw_gauges_on, gauge_cards
 from modeharvest.report.figures.photographs import PhotographState
 from modeharvest.report.figures.sequence import force_cards
 from modeharvest.report.figures.whole_field import whole_cards, whole_panel_numbers
@@ -58,10 +58,12 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
     )
     names = photograph_labels(shown)
     states = figures.photograph_states(harvest, names) if harvest else []
-    buckling = summary.get("buckling") or {}
+    buckling, along = summary.get("buckling") or {}, axis_text(summary.get("angle_deg", 0.0))
     panels = fits.panel_sections(
         _PANELED, photograph_panels(states), states,
-        lambda key, s: panel_numbers(key, frames[s.frame.name]) or fits.shape_numbers(key, s),
+        lambda key, s: (
+            panel_numbers(key, frames[s.frame.name], along) or fits.shape_numbers(key, s)
+        ),
         known="These photographs were made by a simulation, so the truth is known. ",
         source="Fig. 7 of the paper. ", pattern=Markup("v<sub>1</sub>φ<sub>1</sub>"),
     )  # fmt: skip
@@ -181,13 +183,16 @@ def _model_error_key(frame: Frame) -> KeyNumber:
     return KeyNumber.of(name, **frame)
 
 
-def panel_numbers(key: str, frame: Frame) -> str:
-    """Line of numbers below a panel's picture; empty if there is nothing to add."""
+def panel_numbers(key: str, frame: Frame, along: str = "x") -> str:
+    """Line of numbers below a panel's picture; empty if there is nothing to add.
+
+    ``along``: the axis of its strains.
+    """
     local = frame["local"]
     if key.startswith("whole-"):
         return whole_panel_numbers(key, frame["whole_field"])
     if key == "image":
-        return text_of("photographs-image", frame=frame)
+        return text_of("photographs-image", frame=frame, along=along)
     if key == "residual":
         return _residual_numbers(frame)
     if key == "w" and local is not None:
@@ -339,7 +344,7 @@ def _gauge_cards(summary: Summary, states: Sequence[PhotographState]) -> list[Ca
     if rows and states and (whole := states[-1].frame.whole):
         image, gauges = states[-1].frame.image, states[-1].harvest.case.gauges
         placed = partial(draw_gauges_on, whole.measured, gauges, image / image.max(), "mm")
-    return gauge_cards(rows, strains, placed)
+    return gauge_cards(rows, strains, placed, axis_text(summary.get("angle_deg", 0.0)))
 
 
 def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull
 
 from modeharvest.fem.field import Mesh, plane_mesh, read_any_mesh, read_mesh, write_mesh
 from modeharvest.idic.chebyshev import Brightness
@@ -42,21 +41,23 @@ from modeharvest.idic.finite_element.files import (
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import MeshedMaterial, mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.photograph.axes import require_angle, strains_along, turned_sides
 from modeharvest.idic.photograph.displacement import (
+    LOCAL,
     block_motion,
     brightness,
     deformed_mask,
     displacement_from,
+    light_for,
     misfit_of,
     residual,
     speckled,
-    uneven_light,
 )
 from modeharvest.idic.photograph.gauges import (
+    along_axes,
     points_of,
     read_gauges,
     reading_rows,
-    turned_axes,
     write_gauges,
 )
 from modeharvest.idic.photograph.material import find_material
@@ -95,10 +96,12 @@ from modeharvest.util.typed import picked
 
 _LEAST_PX = 1000
 """Smallest number of pixels that a mesh must cover: about four elements."""
-_RECTANGLE, _TURNED_DEG = 0.97, 1.0
-"""Least share of a rectangle that a specimen with straight sides fills; least angle reported."""
 _OVERLAP = 0.01
 """Largest fraction of a mesh's pixels that may lie in two elements."""
+_LOCAL_LIGHT = (
+    "The light changed along the material otherwise than by polynomials: gain and offset were "
+    "taken from around each pixel, which makes errors larger; light the specimen evenly."
+)
 _MESH_FORMAT = "modeharvest-mesh-1"
 
 
@@ -109,8 +112,8 @@ class MeasureCase:
     ``reference``, ``deformed``: image files; ``deformed`` in the order of the test, wildcards
     allowed. ``mask``: an image that is not black on material of the reference; None to find the
     material by its speckle. ``pixel_size`` [mm]; None for lengths in px. ``mesh``: file of a T3 or
-    T6 mesh of the material, readable by meshio; None to mesh the mask. ``brightness``: degree,
-    0 to 6, of the polynomials for gain and offset over an image. ``gauges``: a TOML file of
+    T6 mesh of the material, readable by meshio; None to mesh the mask. ``brightness``: degree, 0 to
+    6, of the polynomials for gain and offset over an image, or "none". ``gauges``: a TOML file of
     gauges for the report. ``angle``: from x to the specimen's axis, counter-clockwise [degrees]:
     mean strains, and those of gauges without an angle, are along it. ``sequence``: the files that
     the names stand for, if these are folders or videos; ``choice``: the command's options for
@@ -122,19 +125,18 @@ class MeasureCase:
     mask: Path | None = None
     pixel_size: float | None = None
     mesh: Path | None = None
-    brightness: int = 1
+    brightness: int | str = 1
     sequence: ChosenFrames | None = None
     choice: tuple[str, ...] = ()
     gauges: Path | None = None
     angle: float = 0.0
 
     def __post_init__(self) -> None:
-        Brightness(self.brightness, self.brightness)  # checks its degree
-        require_within("expected an angle [degrees]", self.angle, -90.0, 90.0)
+        Brightness.of(self.brightness)  # checks it
+        require_angle("--angle", self.angle)
         if self.pixel_size is not None:
             require_within("expected a pixel size [mm]", self.pixel_size, 1e-9, 1e6)
-        named = () if self.sequence else self.files.values()  # files in a folder may be damaged
-        for path in (self.reference, *named, self.mask, self.mesh, self.gauges):
+        for path in (self.mask, self.mesh, self.gauges):
             if path is not None:
                 require_file(path, "a file", "check its name")
 
@@ -143,6 +145,11 @@ class MeasureCase:
         """The files of the deformed images, by image name, in the order of the test."""
         paths = self.sequence.deformed if self.sequence else named_files(Path(), self.deformed)
         return {path.stem: path for path in paths}
+
+    @property
+    def light_degree(self) -> int | None:
+        """Degree of gain and offset; None for images of one brightness."""
+        return Brightness.of(self.brightness).degree
 
     @property
     def unit(self) -> str:
@@ -316,7 +323,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             return found, *write_shapes(folder, name, contours, self.case.unit)
         names = str(self.case.reference), str(self.case.files[name])
         known = 0.0 * body.mesh.nodes if before is None else before.displacement
-        start, light = block_motion(pair, body, known, names), self.case.brightness
+        start, light = block_motion(pair, body, known, names), self.case.light_degree
         return (displacement_from(start, pair, body, light_degree=light, progress=self.progress),)
 
     def _with_roots(self) -> Iterator[tuple[str, NodalResult]]:
@@ -326,7 +333,8 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN outside the material."""
-        return residual(self.pair(name), result.displacement_on(), self.case.brightness)
+        pair, u = self.pair(name), result.displacement_on()
+        return residual(pair, u, light_for(pair, u, self.case.light_degree))
 
     def picture(self, name: str) -> FloatImage:
         """(rows, cols) one deformed image, scaled from 0 (black) to 1 (white)."""
@@ -338,9 +346,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         with exclusive(self.folder):
             require_writable(self.folder)
             gauges = read_gauges(self.case.gauges) if self.case.gauges else ()
-            if angle := self.case.angle:
-                gauges = tuple(g if g.line or g.angle is not None else replace(g, angle=angle)
-                               for g in gauges)  # fmt: skip
+            gauges = along_axes(gauges, self.case.angle)
             for gauge in gauges:  # InputError before measuring, if one is beside the material
                 points_of(gauge, self.grid, self.material.mesh)
             results = self.results()
@@ -377,7 +383,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             else "found by its speckle" if self.plain is None
             else "found by its grey level",
             "notes": [*self.reference.notes, *(case.sequence.notes if case.sequence else ()),
-                      *(() if case.angle else turned_sides(self.material.mask))],
+                      *(() if case.angle else turned_sides(self.material.mask, "--angle"))],
             "warnings": [*self.reference.warnings, *self.material.changes],
             "skipped": [
                 {"name": name, "reason": reason} for name, reason in (
@@ -409,7 +415,8 @@ class MeasureRun(StagedRun[MeasureCase]):
             return numbers
         pair = self.pair(name)
         f, material = pair.reference, pair.masks[0]
-        maps = brightness(pair, u, self.case.brightness)
+        light = light_for(pair, u, self.case.light_degree)
+        maps = brightness(pair, u, light)
         gain, offset = (part[material].mean() for part in maps)
         moved = deformed_mask(self.grid, result.mesh, result.displacement, 0.0)
         noise_g = estimated_noise(pair.deformed, material if moved is None else moved).sd
@@ -423,29 +430,9 @@ class MeasureRun(StagedRun[MeasureCase]):
             "warnings": [
                 *result.warnings,
                 *misfit_of(result, noise, f[material]),
-                *uneven_light(pair, u, self.case.brightness),
+                *(_LOCAL_LIGHT,) * (light == LOCAL),
             ],
         }
-
-
-def turned_sides(mask: BoolArray) -> tuple[str, ...]:
-    """Text if a mask (rows, cols) is a rectangle, but for holes, whose sides are turned."""
-    row, col = np.nonzero(np.diff(mask, axis=1, prepend=False, append=False))
-    corners = np.concatenate([np.column_stack([col, half - row]) for half in (-0.5, 0.5)])
-    hull = ConvexHull(corners)
-    corners = corners[hull.vertices]
-    sides = np.roll(corners, -1, axis=0) - corners
-    angles = (np.degrees(np.arctan2(sides[:, 1], sides[:, 0])) + 45.0) % 90.0 - 45.0
-    turned = (turned_axes(angle) @ corners.T for angle in angles)
-    areas = [float(np.prod(np.ptp(points, axis=1))) for points in turned]
-    best = int(np.argmin(areas))  # of the smallest rectangle around the material
-    angle = float(angles[best])
-    if hull.volume < _RECTANGLE * areas[best] or abs(angle) < _TURNED_DEG:
-        return ()
-    return (
-        f"The specimen's sides are turned by {angle:.1f}° from the picture's axes: mean strains, "
-        f"and those of gauges, are along its own axes with --angle {angle:.1f}.",
-    )
 
 
 def _mean_motion(result: NodalResult, angle: float = 0.0) -> dict[str, float]:
@@ -463,7 +450,7 @@ def _mean_motion(result: NodalResult, angle: float = 0.0) -> dict[str, float]:
         for values in (result.mesh.nodes, result.displacement)
     )
     F = np.eye(2) + np.linalg.lstsq(columns, motion, rcond=None)[0].T
-    along, up = np.linalg.norm(turned_axes(angle) @ F @ turned_axes(angle).T, axis=0) - 1.0
+    along, up = strains_along(F, angle)
     turned = np.degrees(np.arctan2(F[1, 0] - F[0, 1], F[0, 0] + F[1, 1]))
     return {"strain_x": float(along), "strain_y": float(up), "rotation_deg": float(turned)}
 
@@ -471,7 +458,7 @@ def _mean_motion(result: NodalResult, angle: float = 0.0) -> dict[str, float]:
 def measure(
     reference: Path | str, deformed: Sequence[Path | str], folder: Path | str, *,
     mask: Path | str | None = None, pixel_size: float | None = None, mesh: Path | str | None = None,
-    brightness: int = 1, choice: FrameChoice | None = None, log: LogTable | None = None,
+    brightness: int | str = 1, choice: FrameChoice | None = None, log: LogTable | None = None,
     gauges: Path | str | None = None, angle: float = 0.0, progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
@@ -484,14 +471,13 @@ def measure(
     an image, the mask or the mesh can't be used.
     """
     names, choice, log = tuple(map(str, deformed)), choice or FrameChoice(), log or LogTable()
-    sequence = chosen_frames(
-        Path(), str(reference), names, choice, log, Path(folder), progress
-    )  # fmt: skip
     flags = ["--every", str(choice.every)] * (choice.every > 1)
     flags += ["--log", log.file] * bool(log.file)
     case = MeasureCase(
-        sequence.reference, names, None if mask is None else Path(mask),
-        pixel_size, None if mesh is None else Path(mesh), brightness, sequence,
-        tuple(flags), None if gauges is None else Path(gauges), angle,
+        Path(reference), names, None if mask is None else Path(mask), pixel_size,
+        None if mesh is None else Path(mesh), brightness, choice=tuple(flags),
+        gauges=None if gauges is None else Path(gauges), angle=angle,
     )  # fmt: skip
+    found = chosen_frames(Path(), str(reference), names, choice, log, Path(folder), progress)
+    case = replace(case, reference=found.reference, sequence=found)
     return MeasureRun(case, Path(folder), progress).all()

@@ -151,6 +151,11 @@ def draw_gauges_on(
     return drawn
 
 
+def axis_text(angle: float) -> str:
+    """Text for the axis of a specimen at an angle to x [degrees]."""
+    return f"the specimen’s axis, {angle:g}° to x" if angle else "x"
+
+
 def gauge_cards(
     rows: Sequence[Mapping[str, Any]], strains: Mapping[str, float], placed: Draw | None,
     along: str = "x",

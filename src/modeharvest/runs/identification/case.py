@@ -19,6 +19,7 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.fem.path.parameters import PARTS, TILT, TRAVEL, parameter
 from modeharvest.fem.specimen import Imperfection
+from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.finite_element.identification.ansatz_terms import NAMES, Term
 from modeharvest.idic.finite_element.identification.identify import Readings, Unknown
 from modeharvest.imaging.distortion.lens import CameraDistortion
@@ -39,9 +40,8 @@ class MeasuredData:
     placement: Literal["found", "centred"] = "found"
     """Position of the specimen: "found" by its holes in the reference image, then refined with the
     unknowns; or "centred", with its centre at the centre of the images."""
-    light_degree: int | None = 0
-    """Degree (0 to 6) of the polynomials for the difference in gain and offset of the illumination
-    between images; None if there is no difference."""
+    brightness: int | str = 0
+    """Total degree, 0 to 6, of gain and offset between the images' grey levels; or "none"."""
     distortion: str = ""
     """Lens distortion: a file of modeharvest (JSON) or of a calibration program. Images are not
     resampled; points are mapped to their distorted positions."""
@@ -91,8 +91,7 @@ class MeasuredData:
             if (value := getattr(self, name)) is not None:
                 require_within(f"data: expected {name}", value, 0.0, above=True)
         require_within("data: expected strain_sd", self.strain_sd, 0.0, above=True)
-        if self.light_degree is not None:
-            require_within("data: expected light_degree", self.light_degree, 0, 6)
+        Brightness.of(self.brightness)  # checks it
 
     @property
     def forces(self) -> Readings | None:

@@ -22,6 +22,7 @@ import numpy as np
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.path.parameters import PARTS, holes_of, parameter
+from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.finite_element.equations.pixels import MeshPixels
 from modeharvest.idic.finite_element.fields import element_gradients
 from modeharvest.idic.finite_element.identification.ansatz_terms import terms_of, with_terms
@@ -316,7 +317,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
                 none = np.zeros((0, *mesh.nodes.shape))
                 mesh = replace(mesh, nodes=rigidly_moved(mesh.nodes, none, place)[0])
             noise = None if data.noise_sd is None else ImageNoise.of(data.noise_sd)
-            pixels, degree = MeshPixels(mesh), data.light_degree
+            pixels, degree = MeshPixels(mesh), Brightness.of(data.brightness).degree
             light = None if degree is None else partial(alike, degree=degree)
             found = [ImageData(pair, pixels, noise, light, lens) for pair in pairs]
             px = pairs[0].grid.pixel_size

@@ -193,8 +193,8 @@ def _zone(log: FloatArray, times: FloatArray) -> tuple[float, tuple[str, ...]]:
         )
     zone = float(zones[int(np.argmax(np.minimum(shares, _MOST)))])  # the first that will do
     text = (
-        f"The log's clock is {zone / _HOUR:+g} h ahead of the photographs', as in another "
-        "time zone; if that is wrong, give offset_s in [log]."
+        f"The log's clock is {abs(zone) / _HOUR:g} h {'ahead of' if zone > 0 else 'behind'} the "
+        "photographs', as in another time zone; if that is wrong, give offset_s in [log]."
     )
     return zone, (text,) * bool(zone)
 

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.chebyshev import Box, Brightness
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.finite_element.equations.continued import continued
 from modeharvest.idic.finite_element.equations.system import Body
@@ -33,8 +33,9 @@ from modeharvest.idic.finite_element.files import Given, read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.local.field import read_field, write_field
-from modeharvest.idic.photograph.displacement import uneven_light
-from modeharvest.idic.photograph.gauges import points_of, reading_rows, write_gauges
+from modeharvest.idic.photograph.axes import turned_sides
+from modeharvest.idic.photograph.displacement import UNEVEN, uneven_light
+from modeharvest.idic.photograph.gauges import along_axes, points_of, reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
     MeasuredPhotograph,
@@ -99,6 +100,10 @@ _ALONG = 120
 _BOTH = "", "_speckle"
 """Suffixes of the file names of results by contours, and by speckle for comparison."""
 _MUCH = 0.01
+_UNEVEN = (
+    "The light changed along the material, by {:.0f} %, which is taken for displacement: harvest "
+    "with brightness = {} or {} in [correlation], and light the specimen evenly."
+)
 _LEFT = (
     "{:.0f} % of the material has left the image: there v0 and v1 are extrapolated, with larger "
     "errors than their error bars say; the numbers of the pattern are those of the rest"
@@ -183,10 +188,11 @@ class HarvestRun(StagedRun[PhotographCase]):
         """All results of the test, for the report; ``truth``: if they are from a simulation."""
         case, prepared, region = self.case, self.prepared, self.geometry.region
         results, source = self.results(), Path(self.source)
+        turned = () if case.specimen.angle else turned_sides(prepared.mask(), "specimen.angle =")
         known = Harvest(
             case, self.geometry, prepared.image(), (), prepared.noise,
             skipped=(*prepared.skipped, *self.failures()), optics=self.optics,
-            full_scale=prepared.full_scale, text=(*prepared.notes, *region.text),
+            full_scale=prepared.full_scale, text=(*prepared.notes, *region.text, *turned),
             warnings=(*prepared.warnings, *self.geometry.few_cells(case.specimen.cell_size)),
             truth=truth,
             command=command_line("harvest", self.source, "--out", self.folder),
@@ -349,7 +355,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     def _gauges(self) -> list[dict[str, Any]]:
         """Readings of the gauges in every whole displacement; writes ``gauges.csv``."""
-        if not (wanted := self.case.gauges):
+        if not (wanted := along_axes(self.case.gauges, self.case.specimen.angle)):
             return []
         found = {name: self._wholes.path(name) for name, m in self.results().items() if m.whole}
         each = ((name, read_result(path, with_roots=True)) for name, path in found.items())
@@ -400,7 +406,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         found = result.errors
         assert found is not None
         by_noise, by_model_error = error_fields(result, x, y)
-        along, across = mean_strain(result, box)
+        along, across = mean_strain(result, box, case.specimen.angle)
         spectrum = measured_spectrum(measured.local, cell, box)
         pattern = read_pattern(spectrum)
         known, w = measured.local, None
@@ -412,8 +418,9 @@ class HarvestRun(StagedRun[PhotographCase]):
         out = result.outside_image / max(1, result.pixels + result.outside_image)
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
         if self._plain is None and out < 0.5:
-            degree = max(case.correlation.brightness.degrees, default=0)
-            left += uneven_light(pair, result.displacement(), degree)
+            degree = Brightness.of(case.correlation.brightness).degree or 0
+            change = uneven_light(pair, result.displacement(), degree, finer := degree + 1)
+            left += (_UNEVEN.format(100 * change, finer, finer + 1),) * (change > UNEVEN)
         seen = geometry.mask & in_view(result, pair.grid.x, pair.grid.y) if left else geometry.mask
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
@@ -462,6 +469,7 @@ class HarvestRun(StagedRun[PhotographCase]):
     def _prepared_key(self) -> str:
         tables, files = self.case.plain(), prepare.all_files(self.case)
         wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
+        del wanted["specimen"]["angle"]  # of strains and gauges alone
         return stage_key([wanted, [[path.name, sha256_of(path)] for path in files]], *prepare.CODE)
 
 

@@ -164,13 +164,7 @@ def require_inputs(case: PhotographCase) -> None:
     MissingDependencyError if pyvale is asked for and not installed.
     """
     local = case.local
-    files = (*all_files(case), *named_files(case.base, local.files, unique=False))
-    missing = [path for path in files if not path.is_file()]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(
-            f"expected the files that the experiment names, found no file {missing[0]}{more}"
-        )
+    all_files(case)
     of_each_photograph(case, case.specimen.deformed_material, "specimen.deformed_material")
     of_each_photograph(case, local.files, "local.files")
     if local.code == "pyvale":

@@ -319,6 +319,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
         "experiment": harvest.case.plain(),
         "pixel_size_mm": harvest.grid.pixel_size,
         "cell_size_mm": harvest.pitch,
+        "angle_deg": harvest.case.specimen.angle,
         "cellular_mm": astuple(harvest.geometry.region.cellular),
         "domain_mm": astuple(harvest.geometry.region.domain),
         "noise": {

@@ -29,11 +29,12 @@ from modeharvest.imaging.photographs.sequence import (
 )
 from modeharvest.runs.photographs.machine_log import LogTable, offset_between, read_log
 from modeharvest.util.errors import InputError, require_within
-from modeharvest.util.files import sha256_of
+from modeharvest.util.files import require_file, sha256_of
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import Stages, digest
 
 FRAMES = "frames"
+_CHECK = "check its name"
 RECORDED = ("number", "time_s", "force_N", "crosshead_mm", "crosshead_strain")
 
 
@@ -91,13 +92,13 @@ def recorded_with(sequence: ChosenFrames | None, name: str) -> dict[str, Any]:
 def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
     """The files that names, folders of photographs, or patterns with wildcards stand for.
 
-    Sorted by the numbers in their names. Raises InputError if a pattern matches no file, or, with
-    ``unique``, if two files have the same stem, by which results are named.
+    Sorted by the numbers in their names. Raises InputError if no file has a name or matches a
+    pattern, or, with ``unique``, if two files have the same stem, by which results are named.
     """
     paths: list[Path] = []
     for name in names:
-        if any(sign in name for sign in "*?["):
-            matches = map(Path, glob.glob(str(base / name)))
+        if any(sign in name for sign in "*?[") and not (base / name).exists():
+            matches = (base / match for match in glob.glob(name, root_dir=base))
             found = sorted((p for p in matches if p.is_file()), key=natural)
             if not found:
                 raise InputError(f"expected files that match {base / name}, found none")
@@ -105,6 +106,8 @@ def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[
         elif (base / name).is_dir():
             paths += pictures_in(base / name)
         else:
+            if not (base / name).exists():
+                raise InputError(f"expected a file at {base / name}, found no such file; {_CHECK}")
             paths.append(base / name)
     stems = Counter(path.stem for path in paths)
     twice = next((stem for stem, n in stems.items() if n > 1 or stem == "reference"), None)
@@ -151,6 +154,7 @@ def chosen_frames(
 def _reference(base: Path, name: str) -> SequenceFrame:
     """The frame of the undeformed state; of a video the first, or frame 12 of test.mp4#12."""
     if not is_video(name):
+        require_file(base / name, "a photograph", _CHECK)
         return SequenceFrame("reference", base / name)
     file, _, number = name.partition("#")
     if number and not number.isdecimal():

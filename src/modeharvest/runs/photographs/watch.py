@@ -55,7 +55,7 @@ from modeharvest.validation.onset import load_axis, mean_strain
 
 _PIXELS = 0.8e6
 """Approximate number of pixels of a binned photograph."""
-_DEGREES = AnsatzOptions(v0_degree=5, v_degree=4, gain_degree=0, offset_degree=0)
+_DEGREES = AnsatzOptions(v0_degree=5, v_degree=4, brightness=0)
 _QUICK = CorrelationOptions(
     levels=(Level(2, 1.0), FULL), order=3, gradient="deformed",
     gauss_newton=GaussNewtonOptions(tolerance_px=1e-3),
@@ -214,7 +214,7 @@ class QuickMeasurement:
         inside = cellular.contains(*np.meshgrid(few.x, few.y))
         pattern = result.fluctuation(0, few)[inside] / self.grid.pixel_size
         self.thumbnail = pair.deformed
-        strains = mean_strain(result, cellular)
+        strains = mean_strain(result, cellular, self.case.specimen.angle)
         strain = strains[load_axis(np.array([strains]))]
         row = {"name": path.name, "strain": strain, "amplitude_mm": amplitude, "sd_mm": sd}
         row |= {"model_sd_mm": model_sd, "pattern_px": float(np.sqrt(np.mean(pattern**2)))}
@@ -263,6 +263,61 @@ def periodic_families(vectors: FloatArray, cell: float, at: FloatArray) -> list[
     return [ModeFamily("periodic", np.zeros((p.size, 0)), p, np.zeros(0)) for p in flat]
 
 
+class _Watch:
+    """A test while it is watched: measures photographs, and keeps its files up to date."""
+
+    def __init__(self, case: PhotographCase, folder: Path, where: Path) -> None:
+        self.folder, self.title, self.measuring = folder, case.title, QuickMeasurement(case)
+        self.reference = self.measuring.reference.path
+        self._state, self._drawn, self._is_new = _state_of(self.reference), 0.0, True
+        files = sha256_of(self.reference), str(where.absolute())
+        self._key = digest(["periodic modes, files' states", _COLUMNS, case.plain(), *files])
+        self.test = WatchedTest.read(folder / "watch.json", self._key)
+
+    def measure(self, path: Path) -> str:
+        """Measure a photograph that has arrived; returns a line on it, empty if it has gone again.
+
+        InputError if the reference isn't the one of the beginning any more.
+        """
+        if (now := _state_of(self.reference)) and now != self._state:
+            raise InputError(
+                f"expected the reference as it was at first, got another in {self.reference}; "
+                "start again to measure all photographs anew"
+            )
+        again, state = self.test.of_file(path.name) is not None, _state_of(path)
+        if not state:  # deleted; measured if it comes back
+            return ""
+        try:
+            sha = sha256_of(path)
+            entry = self.measuring.measure(path, again)
+        except InputError as error:
+            entry = {"reason": str(error)}
+        except FileNotFoundError:
+            return ""
+        self.test.put(entry | {"name": path.name, "state": state, "sha256": sha})
+        self._is_new = True
+        text = _line(self.test, path.name) if "strain" in entry else f"not used: {entry['reason']}"
+        return f"{path.name}{', changed' * again}: {text}"
+
+    def save(self, after: float = 0.0) -> None:
+        """Write results and page if there is something new, and the last ones are this old [s]."""
+        if self._is_new and time.monotonic() - self._drawn >= after:
+            self._drawn, self._is_new = time.monotonic(), False
+            self._write()
+
+    def conclude(self, text: str) -> None:
+        """Write results and page with the reason why watching has ended."""
+        self.test.conclusion = text
+        self._write()
+
+    def _write(self) -> None:
+        from modeharvest.report.figures.sequence import write_watch_page
+
+        page, picture = self.folder / "watch.html", self.measuring.thumbnail
+        write_json(self.folder / "watch.json", {"key": self._key, **self.test.summary()})
+        write_watch_page(page, self.title, self.test, picture)
+
+
 def watch(
     case: str | Path, folder: Path, photographs: Path | None = None, *,
     until_still: float | None = None, show: Callable[[str], None] = lambda line: None,
@@ -274,8 +329,6 @@ def watch(
     called with a line on the page, then with one for each photograph. Can be interrupted safely.
     Raises InputError if the case, or the reference, can't be used.
     """
-    from modeharvest.report.figures.sequence import write_watch_page
-
     found = PhotographCase.read(case)
     where = found.base / found.images.deformed[0] if photographs is None else photographs
     if not where.is_dir():
@@ -283,52 +336,19 @@ def watch(
             f"expected a folder to watch, got {where}; name it after --watch, or make it"
         )
     with exclusive(folder):
-        measuring = QuickMeasurement(found)
-        files = sha256_of(measuring.reference.path), str(where.absolute())
-        key = digest(["periodic modes, files' states", _COLUMNS, found.plain(), *files])
-        test = WatchedTest.read(folder / "watch.json", key)
-        drawn, is_new, reference = 0.0, True, _state_of(measuring.reference.path)
+        watched, conclusion = _Watch(found, folder, where), ""
         show(f"watching {where}: open {folder / 'watch.html'}")
-
-        def save(after: float = 0.0) -> None:
-            nonlocal drawn, is_new
-            if not is_new or time.monotonic() - drawn < after:
-                return
-            drawn, is_new = time.monotonic(), False
-            write_json(folder / "watch.json", {"key": key, **test.summary()})
-            write_watch_page(folder / "watch.html", found.title, test, measuring.thumbnail)
-
         try:
-            for path in arriving(where, measuring.reference.path, test, until_still, save):
-                if (now := _state_of(measuring.reference.path)) and now != reference:
-                    raise InputError(
-                        f"expected the reference as it was at first, got another in "
-                        f"{measuring.reference.path}; start again to measure all photographs anew"
-                    )
-                again, state = test.of_file(path.name) is not None, _state_of(path)
-                if not state:  # deleted; measured if it comes back
-                    continue
-                try:
-                    sha = sha256_of(path)
-                    entry = measuring.measure(path, again)
-                except InputError as error:
-                    entry = {"reason": str(error)}
-                except FileNotFoundError:
-                    continue
-                test.put(entry | {"name": path.name, "state": state, "sha256": sha})
-                is_new = True
-                text = (
-                    _line(test, path.name) if "strain" in entry else f"not used: {entry['reason']}"
-                )
-                show(f"{path.name}{', changed' * again}: {text}")
-                save(_PAGE_S)
-            test.conclusion = f"No photograph came for {until_still:g} s."
+            for path in arriving(where, watched.reference, watched.test, until_still, watched.save):
+                if line := watched.measure(path):
+                    show(line)
+                    watched.save(_PAGE_S)
+            conclusion = f"No photograph came for {until_still:g} s."
         except KeyboardInterrupt:
-            test.conclusion = "Watching was interrupted."
+            conclusion = "Watching was interrupted."
         finally:
-            is_new = True
-            save()
-    return test
+            watched.conclude(conclusion)
+    return watched.test
 
 
 def arriving(
