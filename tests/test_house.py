@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 172, 35_543
+MOST_MODULES, MOST_LINES = 172, 35_564
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -74,7 +74,8 @@ FIRST_TOUCH = (
     "src/modeharvest/runs/precompile.py",
 )  # fmt: skip
 WHOLE_DISPLACEMENT = (
-    "idic/solver/free_edges.py", "idic/solver/sampling.py", "idic/finite_element/equations", "idic/finite_element/measure.py",
+    "idic/solver/free_edges.py", "idic/solver/sampling.py",
+    "idic/finite_element/equations", "idic/finite_element/measure.py",
     "idic/finite_element/correlation.py", "idic/finite_element/mismatch.py",
     "idic/finite_element/cutoff.py", "idic/finite_element/fields.py", "idic/finite_element/mesh.py",
 )  # fmt: skip
@@ -84,7 +85,7 @@ OWN_BOUNDS = {
     FIRST_TOUCH: (3, 350),
     CONTOURS: (17, 4_418), SEQUENCES: (12, 3_036), EXPLORE: (2, 306), SHARED_DATA: (3, 471),
     GAUGES_AND_FORMATS: (9, 2_024),
-    WHOLE_DISPLACEMENT: (12, 2_606),
+    WHOLE_DISPLACEMENT: (13, 2_688),
 }  # fmt: skip
 """Modules and lines of capabilities that came later, with the modules that they are built into."""
 
