@@ -103,12 +103,17 @@ _SAMPLES, _LEAST = 100_000, 0.1
 class _Swept(NamedTuple):
     """Displacement after the first measurements."""
 
-    unknown: int
-    """Nodes at which the images don't match."""
+    known: BoolArray
+    """(n,) True at nodes at which the images match."""
     start: FloatArray
     """(n, 2) start of the last measurement, smooth and from around where they don't match [mm]."""
     u: FloatArray
     """(n, 2) displacement of the nodes [mm]."""
+
+    @property
+    def unknown(self) -> int:
+        """Number of nodes at which the images don't match."""
+        return int((~self.known).sum())
 
 
 def displacement_from(
@@ -134,22 +139,27 @@ def displacement_from(
 
     def swept(degree: int | str | None) -> _Swept:
         """Repeat the first measurement until the images match everywhere, or no better."""
-        better, u, unknown = start, start, 0 if pair.deformed_mask is not None else len(start)
+        known: BoolArray = np.full(len(start), pair.deformed_mask is not None)
+        found = _Swept(known, start, start)
         for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
-            u, known = coarse_displacement(seen(u, off_px, degree), better, body, options=_FIRST)
+            before, shown = found.unknown, seen(found.u, off_px, degree)
+            u, known = coarse_displacement(shown, found.start, body, options=_FIRST)
             # Where the images don't match, the next one starts from the neighbours' displacement.
             better = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
-            before, unknown = unknown, int((~known).sum())
-            if sweep and not 0 < unknown < before:
+            found = _Swept(known, better, u)
+            if sweep and not 0 < found.unknown < before:
                 break
-        return _Swept(unknown, better, u)
+        return found
 
     first = swept(light_degree)
     if light_degree and first.unknown > _LOST * len(start):  # slopes adapt to a start far off
         first = min(first, swept(0), key=lambda each: each.unknown)
-    light = light_for(pair, _on_pixels(pair, mesh, first.u), light_degree)
+    matched = np.where(first.known[:, None], first.u, np.nan)
+    light = light_for(pair, _on_pixels(pair, mesh, matched), light_degree)
     if light == LOCAL:
-        first = swept(light)
+        local = swept(light)
+        is_lost = local.unknown > first.unknown + _LOST * len(start)
+        first, light = (first, light_degree) if is_lost else (local, light)
     _, start, u = first
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
     pair_alike = seen(u, _AT_EDGE_PX, light)
@@ -350,7 +360,8 @@ def uneven_light(pair: ImagePair, u: FloatArray, degree: int, finer: int | str) 
     ``u`` (rows, cols, 2) [mm]; ``finer``: what describes it, another degree, or LOCAL where u is
     near the truth everywhere.
     """
-    mask, typical = pair.masks[0], float(pair.reference[pair.masks[0]].mean())
+    mask = pair.masks[0] & np.isfinite(u).all(axis=-1)
+    typical = float(pair.reference[mask].mean())
     maps = (brightness(pair, u, each) for each in (degree, finer))
     level, around = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
     low, high = np.quantile(around - level, [0.5 - 0.5 * _MOST, 0.5 + 0.5 * _MOST])
@@ -358,9 +369,9 @@ def uneven_light(pair: ImagePair, u: FloatArray, degree: int, finer: int | str) 
 
 
 def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> int | str | None:
-    """The degree, or LOCAL if the light changed otherwise; ``u`` (rows, cols, 2) [mm]."""
-    if degree is None:
-        return None
+    """The degree, or LOCAL if light changed otherwise; u (rows, cols, 2) [mm], NaN if unknown."""
+    if degree is None or not np.isfinite(u).any():
+        return degree
     images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
     noise = np.linalg.norm([estimated_noise(image, mask).sd for image, mask in images])
     chance = _BY_CHANCE * float(noise) / abs(float(pair.reference[pair.masks[0]].mean()))
