@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 172, 35_564
+MOST_MODULES, MOST_LINES = 172, 35_575
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -80,7 +80,7 @@ WHOLE_DISPLACEMENT = (
     "idic/finite_element/cutoff.py", "idic/finite_element/fields.py", "idic/finite_element/mesh.py",
 )  # fmt: skip
 OWN_BOUNDS = {
-    HOMOGENIZATION: (19, 3_807), OWN_CELLS: (7, 960), IDENTIFICATION: (19, 4_073),
+    HOMOGENIZATION: (19, 3_820), OWN_CELLS: (7, 960), IDENTIFICATION: (19, 4_073),
     DESIGN: (6, 856),
     FIRST_TOUCH: (3, 350),
     CONTOURS: (17, 4_418), SEQUENCES: (12, 3_036), EXPLORE: (2, 306), SHARED_DATA: (3, 471),

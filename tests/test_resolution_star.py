@@ -291,7 +291,7 @@ def test_two_codes_from_their_files_to_the_report(
     assert "were not measured" in capsys.readouterr().out
     text = (out / "report.html").read_text("utf-8")
     page = Page(text)
-    assert {"ranking", "attenuation", "trade-off", "row-0", "error-1", "notes"} <= set(page.ids)
+    assert {"ranking", "attenuation", "trade-off", "row-0", "error-1", "findings"} <= set(page.ids)
     assert all(source.startswith("data:") for source in page.sources)
     assert short_of(codes["fine"]) in text
     assert len((out / "resolution.csv").read_text("utf-8").splitlines()) == 3

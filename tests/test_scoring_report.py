@@ -160,7 +160,7 @@ def test_the_page_is_whole_and_loads_nothing(command: tuple[Path, str, int]) -> 
     outside = [link for link in page.links if not link.startswith("#")]
     assert all(link.startswith("https://doi.org/") for link in outside)
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
-    for name in ("ranking", "histogram", "distribution", "regions", "spectrum", "maps", "notes"):
+    for name in ("ranking", "histogram", "distribution", "regions", "spectrum", "maps", "findings"):
         assert page.ids[name] == 1
     for n in range(3):
         assert all(page.ids[f"{kind}-{n}"] == 1 for kind in ("length", "x", "y"))

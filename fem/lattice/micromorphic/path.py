@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import eigh
 from scipy.optimize import bisect, brentq
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import eigsh
 
 from modeharvest.fem.experiment import SMALLEST_STEP, PathOptions
@@ -22,12 +22,13 @@ from modeharvest.fem.lattice.micromorphic.continuum import HomogenizedBody, Line
 from modeharvest.fem.path.continuation import extrapolate
 from modeharvest.fem.sparse_factor import factorise
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, SingularMatrixError
 
 _ITERATIONS = 8
 # Tolerance: forces of a change of the load by this. One more Newton step removes them, and its
 # linearisation, with an error of 1e-7, is used for moduli and inertia.
-_SMALL = 1e-7
+_SMALL, _SMALL_AT_CRITICAL = 1e-7, 1e-10  # there, rounding changes v of other modes nearly critical
+_SINGULAR = 1e-9  # eigenvalue over the stiffness' diagonal that is zero but for rounding [-]
 _DENSE = 1000  # unknowns up to which all eigenvalues are computed
 _FEW = 6  # number of eigenvalues computed otherwise
 _ALIKE = 1e-6  # critical modes have eigenvalues within this of the lowest one [-]
@@ -97,7 +98,7 @@ class HomogenizedPath:
         self.pitch = 0.5 * float(np.linalg.norm(vectors, axis=1).min())
         """Half the RVE's shorter vector, to which a branch's amplitudes refer [mm]."""
         start = self.equilibrium(0.0, body.start)
-        if start is None or start.negative_eigenvalues:
+        if start is None or start.negative_eigenvalues or self._is_singular():
             what = "homogenized body: expected one that is stable without load, got one that isn't"
             raise InputError(f"{what}; check material and mesh, or take more points")
         self.states = [start]
@@ -106,9 +107,20 @@ class HomogenizedPath:
         self._at_rest = self.last.stiffness
         self.scale = np.abs(self._at_rest.diagonal())
 
+    def _is_singular(self) -> bool:
+        """Whether the last stiffness has an eigenvalue that rounding may make negative or not."""
+        K = self.last.stiffness
+        shift = diags_array(_SINGULAR * np.abs(K.diagonal()))
+        try:
+            return (
+                factorise(csr_array(K - shift).sorted_indices(), definite=False).negative_pivots > 0
+            )
+        except SingularMatrixError:
+            return True
+
     def equilibrium(
         self, load: float, guess: FloatArray, weights: FloatArray | None = None,
-        amplitude: float = 0.0, branch: str = "primary",
+        amplitude: float = 0.0, branch: str = "primary", small: float = _SMALL,
     ) -> HomogenizedState | None:  # fmt: skip
         """The equilibrium near a guess, at a load or with weights . y = amplitude; None if lost."""
         value, count = guess, self.body.free_count
@@ -126,7 +138,7 @@ class HomogenizedPath:
             if not np.isfinite(value).all():
                 return None
             rest = float(np.linalg.norm(at.residual)) + abs(change) * at.load_size
-            if rest <= _SMALL * at.load_size and at.excess <= _SMALL:
+            if rest <= small * at.load_size and at.excess <= small:
                 self.last = at
                 return self._settled(load, value, dy, branch)
         return None
@@ -205,7 +217,8 @@ class HomogenizedPath:
                 if e == load or all(abs(e - other) > far for other in (load, *near)):
                     near.append(e)
             states = [known[e] for e in near[1::-1]] or [ends[0]]
-            found = self.equilibrium(load, _expected(states, load))
+            guess = _expected(states, load)
+            found = self.equilibrium(load, guess, small=_SMALL_AT_CRITICAL)
             if found is None:
                 raise ArithmeticError(f"no equilibrium at the load {load}")
             known[load] = found
