@@ -154,9 +154,13 @@ def displacement_from(
     first = swept(light_degree)
     if light_degree and first.unknown > _LOST * len(start):  # slopes adapt to a start far off
         first = min(first, swept(0), key=lambda each: each.unknown)
+    if pair.deformed_mask is not None and light_degree is not None:  # not measured yet
+        shown = seen(start, _AT_EDGE_PX, light_degree)
+        u, known = coarse_displacement(shown, start, body, options=_FIRST)
+        first = _Swept(known, start, u)
     matched = np.where(first.known[:, None], first.u, np.nan)
     light = light_for(pair, _on_pixels(pair, mesh, matched), light_degree)
-    if light == LOCAL:
+    if light == LOCAL and pair.deformed_mask is None:
         local = swept(light)
         is_lost = local.unknown > first.unknown + _LOST * len(start)
         first, light = (first, light_degree) if is_lost else (local, light)
