@@ -462,6 +462,27 @@ def plate_and_body() -> tuple[ImagePair, Body]:
     return exact, FiniteElementOptions().body(exact.masks[0], GRID)
 
 
+def test_light_is_not_judged_from_a_start_that_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the deformed mask is given it was, and even light was taken from around each pixel."""
+    pair, body = plate_and_body()
+    found: list[int | str | None] = []
+
+    def judged(*given: Any) -> int | str | None:
+        found.append(light_for(*given))
+        return found[-1]
+
+    monkeypatch.setattr("modeharvest.idic.photograph.displacement.light_for", judged)
+    x, y = body.mesh.nodes.T
+    off = (
+        4.0 * GRID.pixel_size * np.stack([np.sin(2 * np.pi * y / 1.2), np.cos(2 * np.pi * x / 1.2)])
+    )
+    result = displacement_from(quadratic_field(body.mesh.nodes) + off.T, pair, body, light_degree=1)
+    assert found == [1]
+    assert pair.truth is not None
+    error = (result.displacement_on() - pair.truth.displacement)[pair.masks[0]] / GRID.pixel_size
+    assert np.abs(error).max() < 0.3
+
+
 @pytest.mark.parametrize(("size_px", "amplitude_px"), [(5.0, 0.0), (12.0, 0.0), (5.0, 0.2)])
 def test_error_bars_of_a_smooth_displacement_count_the_start_s_noise(
     size_px: float, amplitude_px: float
