@@ -462,16 +462,16 @@ def plate_and_body() -> tuple[ImagePair, Body]:
     return exact, FiniteElementOptions().body(exact.masks[0], GRID)
 
 
-def test_light_is_not_judged_from_a_start_that_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_light_is_not_estimated_from_a_start_that_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the deformed mask is given it was, and even light was taken from around each pixel."""
     pair, body = plate_and_body()
     found: list[int | str | None] = []
 
-    def judged(*given: Any) -> int | str | None:
+    def recorded(*given: Any) -> int | str | None:
         found.append(light_for(*given))
         return found[-1]
 
-    monkeypatch.setattr("modeharvest.idic.photograph.displacement.light_for", judged)
+    monkeypatch.setattr("modeharvest.idic.photograph.displacement.light_for", recorded)
     x, y = body.mesh.nodes.T
     off = (
         4.0 * GRID.pixel_size * np.stack([np.sin(2 * np.pi * y / 1.2), np.cos(2 * np.pi * x / 1.2)])
