@@ -259,6 +259,12 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "the same, speckle of 12 px, noise of 2 %": lambda folder: rigid(
         folder, (5.3, -8.6), 10.0, 0.02, 2.5, camera=colour
     ),
+    "turn by 3°, speckle of 24 px, noise of 5 %": lambda folder: rigid(
+        folder, (5.3, -8.6), 3.0, 0.05, 4.8
+    ),
+    "turn by 5°, speckle of 36 px, noise of 2 %": lambda folder: rigid(
+        folder, (5.3, -8.6), 5.0, 0.02, 7.2
+    ),
     "turn by 10°, noise of 1 %, JPEG": lambda folder: rigid(
         folder, (5.3, -8.6), 10.0, 0.01, camera=compressed
     ),

@@ -32,7 +32,7 @@ from whole_field import noisy, specimen_of
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.meshing import mesh_specimen
-from modeharvest.idic.finite_element.correlation import COARSE, MeshCorrelation
+from modeharvest.idic.finite_element.correlation import MeshCorrelation
 from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, LastStage, started
 from modeharvest.idic.finite_element.mesh import quadratic
@@ -105,7 +105,7 @@ def measured(
 ) -> tuple[NodalResult, MeshCorrelation]:
     """The result, and the correlation at its end."""
     last = LastStage(correlation := started(pair, start, body, options), options)
-    for stage in COARSE:
+    for stage in correlation.coarse:
         correlation.through(stage)
     last.regularise()
     return last.result(), correlation

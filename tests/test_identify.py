@@ -33,9 +33,9 @@ from modeharvest.idic.finite_element.identification.observed import (
     rigidly_moved,
     through_lens,
 )
+from modeharvest.idic.finite_element.light import alike
 from modeharvest.idic.finite_element.mesh import quadratic
 from modeharvest.idic.finite_element.result import nodal_values
-from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, Level
 from modeharvest.idic.uncertainty.parameters import undetermined_combinations
@@ -206,7 +206,7 @@ def test_a_specimen_that_is_not_in_the_middle_under_a_light_that_changes() -> No
         gx, gy = X / (1 + e * TRUE[0]), Y / (1 + e * TRUE[0] * TRUE[1])
         f, g = (pattern(a, b) + rng.normal(0.0, NOISE, GRID.shape) for a, b in ((X, Y), (gx, gy)))
         pair = ImagePair(f, 0.8 * g + 0.05, GRID)  # type: ignore[arg-type]
-        data.append(ImageData(pair, pixels, noise, partial(alike, degree=0)))
+        data.append(ImageData(pair, pixels, noise, partial(alike, light=0)))
     where = {n: Unknown(v, (v - 0.2, v + 0.2)) for n, v in zip(PLACE, off, strict=True)}
     found = identify(placed, data, UNKNOWNS | where, pixel_size=0.04, forces=FORCES)  # type: ignore[arg-type]
     assert np.all(np.abs(found.values - np.append(TRUE, place)) < 4.0 * found.sd)

@@ -31,20 +31,12 @@ from modeharvest.idic.finite_element.files import (
     write_csv,
     write_result,
 )
+from modeharvest.idic.finite_element.light import LOCAL, UNEVEN, brightness, light_for, uneven_light
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.local.field import read_field
-from modeharvest.idic.photograph.displacement import (
-    LOCAL,
-    UNEVEN,
-    block_motion,
-    brightness,
-    deformed_mask,
-    displacement_from,
-    light_for,
-    uneven_light,
-)
+from modeharvest.idic.photograph.displacement import block_motion, deformed_mask, displacement_from
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import write_image
@@ -377,11 +369,24 @@ def test_light_that_changes_along_the_material_is_reported(
     assert pair.truth is not None
     lit = pair.with_images(pair.reference, light * pair.deformed)
     u = pair.truth.displacement
-    assert (uneven_light(lit, u, degree, degree + 1) > UNEVEN) == bool(count)
+    assert (uneven_light(lit, u, degree) > UNEVEN) == bool(count)
     assert light_for(lit, u, degree) == (LOCAL if count else degree)
     assert light_for(lit, u, None) is None
     slope = pair.with_images(pair.reference, (1.0 + 0.05 * across) * pair.deformed)
     assert light_for(slope, u, 1) == 1
+
+
+def test_noise_is_no_light() -> None:
+    """In windows of small speckle it was more than the 2 % of light that are tolerated."""
+    grid, rng = PixelGrid.centred(100, 900, 1.0), np.random.default_rng(0)
+    f = 40 + 175 * Speckle(SpeckleSpec(0.1, blur_px=1.5), grid.shape)(
+        *np.meshgrid(*(np.arange(n, dtype=float) for n in grid.shape), indexing="ij")
+    )
+    images = (f + 6.0 * rng.standard_normal(f.shape) for _ in "fg")
+    pair, at_rest = ImagePair(*images, grid), np.zeros((*grid.shape, 2))
+    assert light_for(pair, at_rest, 1) == 1
+    lit = pair.with_images(pair.reference, pair.deformed * (1.2 - 0.4 * abs(grid.x) / grid.x.max()))
+    assert light_for(lit, at_rest, 1) == LOCAL
 
 
 def test_gain_and_offset_around_each_pixel_are_those_of_a_spot() -> None:
@@ -513,6 +518,30 @@ def test_error_bars_of_a_smooth_displacement_count_the_start_s_noise(
     off, sd = np.abs(found.displacement - u(nodes))[seen], found.standard_deviation[seen]
     assert np.mean(off < 1.96 * sd) > 0.8
     assert np.sqrt(np.mean(off**2)) < 1.3 * np.sqrt(np.mean(sd**2))
+
+
+@pytest.mark.parametrize(("size_px", "noise"), [(24.0, 0.05), (36.0, 0.02)])
+def test_coarse_speckle_is_measured_up_to_corners(size_px: float, noise: float) -> None:
+    """First measurements followed its noise at corners, by 5 and 22 px, into the background."""
+    grid, rng = PixelGrid.centred(320, 400, 1.0), np.random.default_rng(0)
+    R, shift = np.array([[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]]), [5.3, -8.6]
+    pattern = Speckle(SpeckleSpec(0.5 / size_px, blur_px=0.3 * size_px), grid.shape)
+    points = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+
+    def inside(at: np.ndarray) -> np.ndarray:
+        return np.asarray((np.abs(at) < [160.0, 120.0]).all(axis=-1))
+
+    f, g = (
+        np.where(inside(at), 0.2 + 0.6 * pattern(*grid.to_px(at[..., 0], at[..., 1])), 0.06)
+        + noise * rng.standard_normal(grid.shape)
+        for at in (points, (points - shift) @ R)
+    )
+    mask = inside(points)
+    pair, body = ImagePair(255 * f, 255 * g, grid, mask), FiniteElementOptions().body(mask, grid)
+    nodes = body.mesh.nodes
+    found = displacement_from(block_motion(pair, body, 0.0 * nodes), pair, body)
+    off = found.displacement - (nodes @ (R - np.eye(2)).T + shift)
+    assert np.abs(off).max() < 0.2
 
 
 @pytest.mark.parametrize("wave_px", [0.0, 1.0])

@@ -64,6 +64,13 @@ COARSE = (Stage(Level(2, 3.0), 120.0, 0.2), Stage(Level(2, 1.5), 50.0, 0.2), Sta
 """Stages before the last, which uses unfiltered images and the cut-off that is searched for. Those
 of blurred images with tolerance 0.4 left places in local minima ("lens" in docs/how-to/scoring.md).
 """
+_COARSE_FROM_PX = 15.0
+"""Speckle size from which on the wavelengths of these stages, and of starts, grow with it [px]."""
+
+
+def coarseness(speckle_px: float) -> float:
+    """Factor of wavelengths: shorter ones aren't determined by speckle of this size [px]."""
+    return max(1.0, speckle_px / _COARSE_FROM_PX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +99,9 @@ class MeshCorrelation:
         pair = pair if body.mask is None else replace(pair, mask=pair.masks[0] & body.mask)
         pair = pair.without_extremes()
         self.speckle_px = speckle_size(pair.reference, pair.mask)
+        factor = coarseness(self.speckle_px)
+        self.coarse = tuple(replace(stage, cutoff_px=factor * stage.cutoff_px) for stage in COARSE)
+        """Stages before the last."""
         given, pair = pair, well_sampled(pair, self.speckle_px)
         self.is_sharp = pair is not given
         """Whether the speckle has edges sharper than pixels: paint of few grey levels."""

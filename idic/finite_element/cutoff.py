@@ -108,6 +108,14 @@ def least_risk(
     return tuple(tried)
 
 
+def longer_cutoff(at: Linearised, first_px: float, pixel_size: float, excess: float) -> float:
+    """Cut-off wavelength up to which the estimated risk falls, in steps of a factor of two [px]."""
+    value, cutoff_px = np.inf, first_px
+    while cutoff_px < _MOST_PX and (found := risk(at, cutoff_px, pixel_size, excess).value) < value:
+        value, cutoff_px = found, 2.0 * cutoff_px
+    return max(first_px, 0.5 * cutoff_px)
+
+
 def best_of(tried: Sequence[Risk]) -> float:
     """Cut-off wavelength at the vertex of the parabola through the lowest risk and neighbours [px].
 

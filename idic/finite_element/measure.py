@@ -14,7 +14,7 @@ import numpy as np
 
 from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.materials import Material
-from modeharvest.idic.finite_element.correlation import COARSE, MeshCorrelation, Stage
+from modeharvest.idic.finite_element.correlation import MeshCorrelation, Stage, coarseness
 from modeharvest.idic.finite_element.cutoff import (
     Deviations,
     Risk,
@@ -22,6 +22,7 @@ from modeharvest.idic.finite_element.cutoff import (
     contradicted,
     deviations,
     least_risk,
+    longer_cutoff,
     risk,
     uncertain,
 )
@@ -47,9 +48,8 @@ from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import picked
 
-_FIRST_PX = 18.0
-"""Cut-off wavelength at which the search for the best one begins [px]; below, with a law."""
 _FIRST_WITH_LAW_PX = 150.0
+"""Cut-off wavelength at which the search for the best one begins with a law [px]."""
 _WRONG = 0.075
 """Share of edge nodes contradicting a law above which a warning says it is wrong; not 0.003, as
 smoothing removes more at edges than error bars include (docs/explanation/whole_field_laws.md)."""
@@ -80,6 +80,8 @@ class FiniteElementOptions:
     """Edge length of elements inside the body and along its edges, if a mesh is generated [px]."""
     cutoff_px: float | None = None
     """Cut-off wavelength of the last stage [px]; None for that of the lowest estimated risk."""
+    first_px: float = 18.0
+    """Cut-off wavelength at which that search begins without a law [px]."""
     law: Law | None = None
     """Regularises the last stage; None for smoothness of the difference from the start."""
     edge_px: int = 0
@@ -90,7 +92,13 @@ class FiniteElementOptions:
     """Without a law: whether to use the strain relation of free edges, see ``free_edges``."""
 
     def __post_init__(self) -> None:
-        for name, low in (("element_px", 4), ("edge_element_px", 4), ("edge_px", 0), ("steps", 1)):
+        for name, low in (
+            ("element_px", 4),
+            ("edge_element_px", 4),
+            ("edge_px", 0),
+            ("steps", 1),
+            ("first_px", 1),
+        ):
             require_within(f"finite-element DIC: expected {name}", getattr(self, name), low)
         if self.cutoff_px is not None:
             require_within("finite-element DIC: expected cutoff_px", self.cutoff_px, 0, above=True)
@@ -129,10 +137,10 @@ def measure_displacement(
     options = options or FiniteElementOptions()
     correlation = started(pair, start, on, options)
     last = LastStage(correlation, options)
-    for stage in counted((*COARSE, None), progress, "whole displacement"):
+    for stage in counted((*correlation.coarse, None), progress, "whole displacement"):
         if stage is None:
-            again_where_unlike(correlation, *COARSE)
-            leave_out_specks(correlation, *COARSE)
+            again_where_unlike(correlation)
+            leave_out_specks(correlation)
             last.regularise()
         else:
             correlation.through(stage)
@@ -141,15 +149,19 @@ def measure_displacement(
 
 def coarse_displacement(
     pair: ImagePair, start: Start, on: Body, *, options: FiniteElementOptions
-) -> tuple[FloatArray, BoolArray]:
-    """(n, 2) u [mm] before the search for the last cut-off; (n,) True at nodes with matched images.
+) -> tuple[FloatArray, BoolArray, float]:
+    """(n, 2) u [mm], (n,) True at nodes where the images match, and the cut-off wavelength [px].
 
     At other nodes u is in a local minimum. For the arguments see :func:`measure_displacement`.
     """
     correlation = started(pair, start, on, options)
-    for stage in (*COARSE, Stage(FULL, _FIRST_PX)):
+    for stage in correlation.coarse:
         correlation.through(stage)
-    return correlation.u.reshape(-1, 2), matched(correlation)
+    first, at = options.first_px * coarseness(correlation.speckle_px), correlation.linearised(True)
+    # Shorter waves of coarse or noisy speckle are noise that takes corners into the background.
+    cutoff = longer_cutoff(at, first, pair.grid.pixel_size, at.mean(correlation.noise_in(at)))
+    correlation.through(Stage(FULL, cutoff))
+    return correlation.u.reshape(-1, 2), matched(correlation), cutoff
 
 
 def started(
@@ -188,7 +200,7 @@ class LastStage:
         correlation, mesh = self.correlation, self.body.mesh
         law, given = self.options.law, self.options.cutoff_px
         correlation.noise_power = noise_power(correlation)
-        self.with_cutoff(_FIRST_PX, None if law is not None else given)
+        self.with_cutoff(self.options.first_px, None if law is not None else given)
         if law is None and self.options.free_edges:
             self._through_edges()
         elif law is not None:
@@ -210,7 +222,7 @@ class LastStage:
                     break
         correlation.through(last := Stage(FULL, cutoff, _LAST_TOLERANCE_PX))
         if isinstance(correlation.prior, Smoothness):  # short ones may lose what noisy images show
-            again_where_unlike(correlation, *COARSE, last)
+            again_where_unlike(correlation, last)
         self.cutoff_px = cutoff
 
     def _through_edges(self) -> None:

@@ -57,12 +57,13 @@ def unlike(correlation: MeshCorrelation, at: Linearised | None = None) -> BoolAr
     return np.asarray(sums.squares > expected)
 
 
-def again_where_unlike(correlation: MeshCorrelation, *stages: Stage) -> None:
+def again_where_unlike(correlation: MeshCorrelation, *then: Stage) -> None:
     """Measure again from the displacement around where images don't match, while that helps.
 
-    Where it doesn't, pixels don't count.
+    Where it doesn't, pixels don't count. ``then``: stages after the coarse ones.
     """
-    body, pixels = correlation.body, np.diff(correlation.on(FULL).pixels.start)
+    stages, body = (*correlation.coarse, *then), correlation.body
+    pixels = np.diff(correlation.on(FULL).pixels.start)
     while pixels[off := unlike(correlation)].sum() > _SOME_PIXELS:
         u, prior, known = correlation.u, correlation.prior, body.away_from(off, _AROUND)
         smooth = correlation.from_around(correlation.start, known)
@@ -77,7 +78,7 @@ def again_where_unlike(correlation: MeshCorrelation, *stages: Stage) -> None:
         correlation.start = start
 
 
-def leave_out_specks(correlation: MeshCorrelation, *stages: Stage) -> None:
+def leave_out_specks(correlation: MeshCorrelation) -> None:
     """Measure without places that differ, too small for an element not to match: such as dust.
 
     The cut-off wavelength is found from the residual of all pixels.
@@ -91,7 +92,7 @@ def leave_out_specks(correlation: MeshCorrelation, *stages: Stage) -> None:
         if not specks.any():
             break
         correlation.without(correlation.hidden | grown(specks, BESIDE_PX))
-        for stage in stages:
+        for stage in correlation.coarse:
             correlation.through(stage)
 
 

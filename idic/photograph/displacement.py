@@ -12,20 +12,15 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import label, mean
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.chebyshev import Box, ChebyshevField
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.finite_element.correlation import coarseness
 from modeharvest.idic.finite_element.equations.system import Body
-from modeharvest.idic.finite_element.local_light import (
-    ROUNDS,
-    UNLIKE,
-    WINDOW,
-    local_gain_and_offset,
-)
+from modeharvest.idic.finite_element.light import LOCAL, Light, alike, light_for, on_pixels
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
     coarse_displacement,
@@ -49,7 +44,6 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.bernstein import non_positive_jacobians
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.masks import shrunk
@@ -89,18 +83,9 @@ _MISFIT, _SLIGHT = 2.0, 0.03
 _OFF_PX, _AT_EDGE_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0), 1.0
 """Possible error of edges after blocks of speckle, one for each first measurement (repeated until
 the images match everywhere, or no better), and before the last measurement."""
-UNEVEN, _MOST = 0.02, 0.96
-"""Range of the light's relative change over most of the material that polynomials may leave
-undescribed. Without any change, noise of 3 % in a strip of 360 x 40 px makes 0.012 of it."""
-_BY_CHANCE = 0.2
-"""That range by noise alone, at most, over the noise's share of the mean level."""
-LOCAL = "local"
-"""Gain and offset from around each pixel, instead of a degree."""
-_SAMPLES, _LEAST = 100_000, 0.1
-"""Pixels from which brightness is fitted; least gain anywhere, over the mean."""
 
 
-class _Swept(NamedTuple):
+class _Coarse(NamedTuple):
     """Displacement after the first measurements."""
 
     known: BoolArray
@@ -109,11 +94,70 @@ class _Swept(NamedTuple):
     """(n, 2) start of the last measurement, smooth and from around where they don't match [mm]."""
     u: FloatArray
     """(n, 2) displacement of the nodes [mm]."""
+    cutoff_px: float = _LAST.first_px
+    """Cut-off wavelength that suits the noise [px]."""
 
     @property
     def unknown(self) -> int:
         """Number of nodes at which the images don't match."""
         return int((~self.known).sum())
+
+
+class _FirstMeasurements:
+    """They find the deformed image's mask, how the light changed, and the last one's start."""
+
+    def __init__(self, start: FloatArray, pair: ImagePair, body: Body) -> None:
+        self.start, self.pair, self.body = start, pair, body
+        self.is_given = pair.deformed_mask is not None
+        self.wave = shortest_wave(pair)
+
+    def images(self, u: FloatArray, off_px: float, light: Light) -> ImagePair:
+        """The images, equally bright, without what shows background if edges are off this much."""
+        pair, mesh = self.pair, self.body.mesh
+        u = _unfolded(u, self.body, self.wave)
+        pair_alike, mask = alike(pair, mesh, u, light), pair.deformed_mask
+        if pair.mask is not None and not pair.mask.all() and not self.is_given:
+            mask = deformed_mask(pair.grid, mesh, u, off_px)
+        return replace(pair_alike, deformed_mask=mask)
+
+    def smooth(self, u: FloatArray, cutoff_px: float, known: BoolArray) -> FloatArray:
+        """(n, 2) start without waves that are noise, from nodes (n,) where u is known [mm]."""
+        cutoff = cutoff_px * self.pair.grid.pixel_size
+        is_long = cutoff > _SMOOTHER_FROM * self.wave
+        return self.body.smoothed(u, _OVER_CUTOFFS[0] * cutoff if is_long else self.wave, known)
+
+    def by(self, light: Light) -> _Coarse:
+        """Measure until the images match everywhere, or no better; once with a mask given.
+
+        The start of a photograph whose mask is known is kept.
+        """
+        found = _Coarse(np.zeros(len(self.start), np.bool_), self.start, self.start)
+        for sweep, off_px in enumerate(_OFF_PX):
+            before, images = found.unknown, self.images(found.u, off_px, light)
+            u, known, cutoff_px = coarse_displacement(
+                images, found.start, self.body, options=_FIRST
+            )
+            if self.is_given:
+                return _Coarse(known, self.start, u, cutoff_px)
+            # Where the images don't match, the next one starts from the neighbours' displacement.
+            found = _Coarse(known, self.smooth(u, cutoff_px, known), u, cutoff_px)
+            if sweep and not 0 < found.unknown < before:
+                break
+        return found
+
+    def with_its_light(self, degree: int | None) -> tuple[_Coarse, Light]:
+        """Measure with the light that describes the images: the degree, or LOCAL."""
+        if degree is None and self.is_given:
+            return _Coarse(np.ones(len(self.start), np.bool_), self.start, self.start), None
+        first, lost = self.by(degree), _LOST * len(self.start)
+        if degree and first.unknown > lost:  # slopes adapt to a start far off
+            first = min(first, self.by(0), key=lambda each: each.unknown)
+        matched = np.where(first.known[:, None], first.u, np.nan)
+        light = light_for(self.pair, on_pixels(self.pair.grid, self.body.mesh, matched), degree)
+        if light != LOCAL or self.is_given:
+            return first, light
+        local = self.by(light)
+        return (first, degree) if local.unknown > first.unknown + lost else (local, light)
 
 
 def displacement_from(
@@ -127,56 +171,27 @@ def displacement_from(
     ``light_degree``: of the polynomials by which gain and offset vary over the reference, if these
     describe the light; else it is taken from around each pixel. None for images of one brightness.
     """
-    mesh = body.mesh
-    is_sought = pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None
-
-    def seen(u: FloatArray, off_px: float, degree: int | str | None) -> ImagePair:
-        """The images, equally bright, without what shows background if edges are off this much."""
-        u = _unfolded(u, body, _SMOOTH_PX * pair.grid.pixel_size)
-        pair_alike = alike(pair, mesh, u, degree)
-        mask = deformed_mask(pair.grid, mesh, u, off_px) if is_sought else pair.deformed_mask
-        return replace(pair_alike, deformed_mask=mask)
-
-    def swept(degree: int | str | None) -> _Swept:
-        """Repeat the first measurement until the images match everywhere, or no better."""
-        known: BoolArray = np.full(len(start), pair.deformed_mask is not None)
-        found = _Swept(known, start, start)
-        for sweep, off_px in enumerate(_OFF_PX if pair.deformed_mask is None else ()):
-            before, shown = found.unknown, seen(found.u, off_px, degree)
-            u, known = coarse_displacement(shown, found.start, body, options=_FIRST)
-            # Where the images don't match, the next one starts from the neighbours' displacement.
-            better = body.smoothed(u, _SMOOTH_PX * pair.grid.pixel_size, known)
-            found = _Swept(known, better, u)
-            if sweep and not 0 < found.unknown < before:
-                break
-        return found
-
-    first = swept(light_degree)
-    if light_degree and first.unknown > _LOST * len(start):  # slopes adapt to a start far off
-        first = min(first, swept(0), key=lambda each: each.unknown)
-    if pair.deformed_mask is not None and light_degree is not None:  # not measured yet
-        shown = seen(start, _AT_EDGE_PX, light_degree)
-        u, known = coarse_displacement(shown, start, body, options=_FIRST)
-        first = _Swept(known, start, u)
-    matched = np.where(first.known[:, None], first.u, np.nan)
-    light = light_for(pair, _on_pixels(pair, mesh, matched), light_degree)
-    if light == LOCAL and pair.deformed_mask is None:
-        local = swept(light)
-        is_lost = local.unknown > first.unknown + _LOST * len(start)
-        first, light = (first, light_degree) if is_lost else (local, light)
-    _, start, u = first
+    first = _FirstMeasurements(start, pair, body)
+    coarse, light = first.with_its_light(light_degree)
+    options = replace(options, first_px=coarse.cutoff_px)
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
-    pair_alike = seen(u, _AT_EDGE_PX, light)
-    found = measured(pair_alike, start)
-    if found.cutoff_px is None or found.cutoff_px < _SMOOTHER_FROM * _SMOOTH_PX:
+    images = first.images(coarse.u, _AT_EDGE_PX, light)
+    found = measured(images, coarse.start)
+    wave = (found.cutoff_px or 0.0) * pair.grid.pixel_size
+    if wave < _SMOOTHER_FROM * first.wave:
         return found
     # Shorter waves of the start are noise of the same images, which no error estimate would count.
-    wave = found.cutoff_px * pair.grid.pixel_size
     for over in _OVER_CUTOFFS:
-        smoother = measured(pair_alike, body.smoothed(start, over * wave))
-        if smoother.cutoff_px is not None and smoother.cutoff_px >= found.cutoff_px:
+        smoother = measured(images, body.smoothed(coarse.start, over * wave))
+        if (smoother.cutoff_px or 0.0) * pair.grid.pixel_size >= wave:
             break
     return smoother
+
+
+def shortest_wave(pair: ImagePair) -> float:
+    """Wavelength of an initial guess below which it is noise [mm]."""
+    speckle_px = speckle_size(pair.reference, pair.masks[0])
+    return _SMOOTH_PX * coarseness(speckle_px) * pair.grid.pixel_size
 
 
 def _unfolded(u: FloatArray, body: Body, wave: float) -> FloatArray:
@@ -240,7 +255,7 @@ def block_motion(
         keep = _like_neighbours(left, pair.grid.pixel_size)
         spline = RBFInterpolator(left.points[keep], left.u[keep], neighbors=30)
         known = known + spline(mesh.nodes)
-    return body.smoothed(known, _SMOOTH_PX * pair.grid.pixel_size)
+    return body.smoothed(known, shortest_wave(pair))
 
 
 def _polynomial(mesh: Mesh, pair: ImagePair, blocks: LocalField) -> FloatArray:
@@ -295,93 +310,6 @@ def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) ->
     return inner if inner is not None and inner.any() else None
 
 
-def _on_pixels(pair: ImagePair, mesh: Mesh, u: FloatArray) -> FloatArray:
-    """(rows, cols, 2) nodal displacement u (n, 2) at the pixels; NaN beside the mesh."""
-    at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
-    return np.moveaxis(at, 0, -1)
-
-
-def alike(pair: ImagePair, mesh: Mesh, u: FloatArray, degree: int | str | None) -> ImagePair:
-    """Make brightness and contrast of the pair equal, in the reference's levels; u (n, 2) [mm]."""
-    gain, offset = brightness(pair, _on_pixels(pair, mesh, u), degree)
-    a, b = (part[pair.masks[0]].mean() for part in (gain, offset))
-    reference = a * (pair.reference - offset) / gain + b
-    return pair.with_images(reference.astype(np.float32), a * pair.deformed + b)
-
-
-def brightness(
-    pair: ImagePair, u: FloatArray, degree: int | str | None = 0
-) -> tuple[FloatArray, FloatArray]:
-    """Gain [-] and offset [grey levels], (rows, cols), that make g(x + u) as bright as f.
-
-    Polynomials of total degree ``degree`` that give both images the same mean and contrast: so a
-    displacement that is off by some pixels hardly matters. Edges and pixels that don't match don't
-    count. ``u`` (rows, cols, 2) [mm], NaN where it isn't known. Degree None: neither, 1 and 0;
-    LOCAL: from mean and contrast around each pixel.
-    """
-    if degree is None:
-        return np.ones(pair.grid.shape), np.zeros(pair.grid.shape)
-    grid, inner = pair.grid, shrunk(pair.masks[0], _OFF_PX[0])
-    inner = (inner if inner.any() else pair.masks[0]) & np.isfinite(u).all(axis=-1)
-    every = max(1, int(inner.sum() / _SAMPLES))
-    both = np.stack([part[::every] for part in _compared(pair, u, inner)], axis=1, dtype=float)
-    there = np.isfinite(both[:, 1])
-    if not there.any() or not np.ptp(both[there, 1]) > 0.0:
-        raise InputError("expected pixels of the material in both images, got none in common")
-    row, col = (places[::every] for places in np.nonzero(inner))
-    if degree == LOCAL:
-        width = WINDOW * speckle_size(pair.reference, pair.masks[0])
-        a, b = local_gain_and_offset(row, col, both, grid.shape, width)
-        return np.maximum(a, _LEAST * a[pair.masks[0]].mean()), b
-    field = ChebyshevField(Box(*grid.x[[0, -1]], *grid.y[[-1, 0]]), int(degree))
-    basis = field.basis(grid.x[col], grid.y[row])
-    for _ in range(ROUNDS):
-        within = basis[there]
-        mean = within @ np.linalg.lstsq(within, both[there])[0]
-        f, g = np.abs(both[there] - mean).T
-        gain = np.linalg.lstsq(within.T @ (g[:, None] * within), within.T @ f)[0]
-        left = both[:, 0] - basis @ gain * both[:, 1]
-        offset = np.linalg.lstsq(within, left[there])[0]
-        off = np.abs(left - basis @ offset)
-        there = off <= UNLIKE * np.nanmedian(off)
-    a, b = (field.evaluate(part, grid.x[None], grid.y[:, None]) for part in (gain, offset))
-    return np.maximum(a, _LEAST * a[pair.masks[0]].mean()), b
-
-
-def residual(pair: ImagePair, u: FloatArray, degree: int | str | None = 0) -> FloatArray:
-    """(rows, cols) f - gain g(x + u) - offset [grey levels]; NaN outside material and image."""
-    gain, offset = brightness(pair, u, degree)
-    known = pair.masks[0] & np.isfinite(u).all(axis=-1)
-    f, g = _compared(pair, u, known)
-    found = np.full(pair.grid.shape, np.nan)
-    found[known] = f - gain[known] * g - offset[known]
-    return found
-
-
-def uneven_light(pair: ImagePair, u: FloatArray, degree: int, finer: int | str) -> float:
-    """Range of the light's relative change over the material that a degree doesn't describe [-].
-
-    ``u`` (rows, cols, 2) [mm]; ``finer``: what describes it, another degree, or LOCAL where u is
-    near the truth everywhere.
-    """
-    mask = pair.masks[0] & np.isfinite(u).all(axis=-1)
-    typical = float(pair.reference[mask].mean())
-    maps = (brightness(pair, u, each) for each in (degree, finer))
-    level, around = ((typical - offset[mask]) / gain[mask] for gain, offset in maps)
-    low, high = np.quantile(around - level, [0.5 - 0.5 * _MOST, 0.5 + 0.5 * _MOST])
-    return float((high - low) / abs(around.mean()))
-
-
-def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> int | str | None:
-    """The degree, or LOCAL if light changed otherwise; u (rows, cols, 2) [mm], NaN if unknown."""
-    if degree is None or not np.isfinite(u).any():
-        return degree
-    images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
-    noise = np.linalg.norm([estimated_noise(image, mask).sd for image, mask in images])
-    chance = _BY_CHANCE * float(noise) / abs(float(pair.reference[pair.masks[0]].mean()))
-    return LOCAL if uneven_light(pair, u, degree, LOCAL) > max(UNEVEN, chance) else degree
-
-
 def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple[str, ...]:
     """Warn if images don't match somewhere: the residual is above noise, and not slight.
 
@@ -397,13 +325,3 @@ def misfit_of(result: NodalResult, noise: float, reference: FloatImage) -> tuple
         "images in between, a mask without what is not material, or, where the light changed along "
         "the material, a brightness that varies.",
     )
-
-
-def _compared(
-    pair: ImagePair, u: FloatArray, where: BoolArray
-) -> tuple[NDArray[np.float32], FloatArray]:
-    """(p,) f and g(x + u) of those pixels where u is known, NaN where that is outside the image."""
-    rows, cols = np.nonzero(where & np.isfinite(u).all(axis=-1))
-    moved = u[rows, cols] / pair.grid.pixel_size
-    g, _, _ = SplineImage.of(pair.deformed, 5).sample(rows - moved[:, 1], cols + moved[:, 0])
-    return pair.reference[rows, cols], g

@@ -38,19 +38,16 @@ from modeharvest.idic.finite_element.files import (
     write_result,
     write_vtu,
 )
+from modeharvest.idic.finite_element.light import LOCAL, brightness, light_for, residual
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import MeshedMaterial, mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.photograph.axes import require_angle, strains_along, turned_sides
 from modeharvest.idic.photograph.displacement import (
-    LOCAL,
     block_motion,
-    brightness,
     deformed_mask,
     displacement_from,
-    light_for,
     misfit_of,
-    residual,
     speckled,
 )
 from modeharvest.idic.photograph.gauges import (

@@ -46,8 +46,8 @@ from modeharvest.idic.finite_element.identification.observed import (
     imaged,
     rigidly_moved,
 )
+from modeharvest.idic.finite_element.light import alike
 from modeharvest.idic.local.field import LocalField, read_field
-from modeharvest.idic.photograph.displacement import alike
 from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.idic.uncertainty.parameters import compared_by_evidence
@@ -318,7 +318,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
                 mesh = replace(mesh, nodes=rigidly_moved(mesh.nodes, none, place)[0])
             noise = None if data.noise_sd is None else ImageNoise.of(data.noise_sd)
             pixels, degree = MeshPixels(mesh), Brightness.of(data.brightness).degree
-            light = None if degree is None else partial(alike, degree=degree)
+            light = None if degree is None else partial(alike, light=degree)
             found = [ImageData(pair, pixels, noise, light, lens) for pair in pairs]
             px = pairs[0].grid.pixel_size
         length, frame = float(np.ptp(mesh.nodes[:, 0])), dict[str, Unknown]()
@@ -343,7 +343,7 @@ class IdentificationRun(StagedRun[IdentificationCase]):
     def _exposed(self, images: ImageSet, mesh: Mesh) -> Iterator[ImageData]:
         """The image data of a twin, for each strain; its lens distortion is known."""
         lens, grid = self.case.imaging.lens(images.grid.shape), images.grid
-        light = partial(alike, degree=0) if self.case.imaging.sensor.flicker else None
+        light = partial(alike, light=0) if self.case.imaging.sensor.flicker else None
         reference, pixels = images.reference(camera=True), MeshPixels(mesh)
         for e in images.strains:
             at = ((None, images.mask()), (e, images.deformed_mask(e)))

@@ -30,11 +30,11 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.finite_element.equations.continued import continued
 from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import Given, read_result
+from modeharvest.idic.finite_element.light import UNEVEN, uneven_light
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField
 from modeharvest.idic.local.field import read_field, write_field
 from modeharvest.idic.photograph.axes import turned_sides
-from modeharvest.idic.photograph.displacement import UNEVEN, uneven_light
 from modeharvest.idic.photograph.gauges import along_axes, points_of, reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import (
@@ -419,8 +419,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
         if self._plain is None and out < 0.5:
             degree = Brightness.of(case.correlation.brightness).degree or 0
-            change = uneven_light(pair, result.displacement(), degree, finer := degree + 1)
-            left += (_UNEVEN.format(100 * change, finer, finer + 1),) * (change > UNEVEN)
+            change = uneven_light(pair, result.displacement(), degree)
+            left += (_UNEVEN.format(100 * change, degree + 1, degree + 2),) * (change > UNEVEN)
         seen = geometry.mask & in_view(result, pair.grid.x, pair.grid.y) if left else geometry.mask
         return HarvestedFrame(
             name=name, strain_x=along, strain_y=across, image=pair.deformed,
