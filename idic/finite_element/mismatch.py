@@ -89,9 +89,10 @@ def leave_out_specks(correlation: MeshCorrelation) -> None:
         residual = correlation.residual(pixels)
         limit = _limit(pixels, residual[pixels.row, pixels.col][::_EVERY])
         specks = large_parts(np.abs(residual) > limit, least)
-        if not specks.any():
+        hidden = correlation.hidden | grown(specks, BESIDE_PX)
+        if not specks.any() or hidden[pixels.row, pixels.col].mean() > _MOST_HIDDEN:
             break
-        correlation.without(correlation.hidden | grown(specks, BESIDE_PX))
+        correlation.without(hidden)
         for stage in correlation.coarse:
             correlation.through(stage)
 
