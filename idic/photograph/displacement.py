@@ -82,7 +82,7 @@ _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which they don't match."""
 _OFF_PX, _AT_EDGE_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0), 1.0
 """Possible error of edges after blocks of speckle, one for each first measurement (repeated until
-the images match everywhere, or no better), and before the last measurement."""
+the images match everywhere, or twice no better), and before the last measurement."""
 
 
 class _Coarse(NamedTuple):
@@ -127,13 +127,14 @@ class _FirstMeasurements:
         return self.body.smoothed(u, _OVER_CUTOFFS[0] * cutoff if is_long else self.wave, known)
 
     def by(self, light: Light) -> _Coarse:
-        """Measure until the images match everywhere, or no better; once with a mask given.
+        """Measure until the images match everywhere, or twice no better; once with a mask given.
 
         The start of a photograph whose mask is known is kept.
         """
-        found = _Coarse(np.zeros(len(self.start), np.bool_), self.start, self.start)
+        found = best = _Coarse(np.zeros(len(self.start), np.bool_), self.start, self.start)
+        no_better = 0
         for sweep, off_px in enumerate(_OFF_PX):
-            before, images = found.unknown, self.images(found.u, off_px, light)
+            images = self.images(found.u, off_px, light)
             u, known, cutoff_px = coarse_displacement(
                 images, found.start, self.body, options=_FIRST
             )
@@ -141,9 +142,11 @@ class _FirstMeasurements:
                 return _Coarse(known, self.start, u, cutoff_px)
             # Where the images don't match, the next one starts from the neighbours' displacement.
             found = _Coarse(known, self.smooth(u, cutoff_px, known), u, cutoff_px)
-            if sweep and not 0 < found.unknown < before:
+            no_better += sweep > 1 and found.unknown >= best.unknown
+            best = found if sweep < 2 or found.unknown <= best.unknown else best
+            if sweep and (found.unknown == 0 or no_better == 2):
                 break
-        return found
+        return best
 
     def with_its_light(self, degree: int | None) -> tuple[_Coarse, Light]:
         """Measure with the light that describes the images: the degree, or LOCAL."""
