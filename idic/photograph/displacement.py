@@ -120,11 +120,18 @@ class _FirstMeasurements:
             mask = deformed_mask(pair.grid, mesh, u, off_px)
         return replace(pair_alike, deformed_mask=mask)
 
-    def smooth(self, u: FloatArray, cutoff_px: float, known: BoolArray) -> FloatArray:
-        """(n, 2) start without waves that are noise, from nodes (n,) where u is known [mm]."""
+    def next_start(self, u: FloatArray, cutoff_px: float, known: BoolArray) -> FloatArray:
+        """(n, 2) u [mm] without waves that are noise, from nodes (n,) at which the images match.
+
+        Elsewhere it is the neighbours' displacement, brought closer by blocks.
+        """
         cutoff = cutoff_px * self.pair.grid.pixel_size
-        is_long = cutoff > _SMOOTHER_FROM * self.wave
-        return self.body.smoothed(u, _OVER_CUTOFFS[0] * cutoff if is_long else self.wave, known)
+        wave = _OVER_CUTOFFS[0] * cutoff if cutoff > _SMOOTHER_FROM * self.wave else self.wave
+        start = self.body.smoothed(u, wave, known)
+        if known.all():
+            return start
+        match = _matched(self.pair, self.body.mesh, start, BLOCKS)
+        return _closer(self.pair, self.body, start, match) if match.is_same else start
 
     def by(self, light: Light) -> _Coarse:
         """Measure until the images match everywhere, or twice no better; once with a mask given.
@@ -140,8 +147,7 @@ class _FirstMeasurements:
             )
             if self.is_given:
                 return _Coarse(known, self.start, u, cutoff_px)
-            # Where the images don't match, the next one starts from the neighbours' displacement.
-            found = _Coarse(known, self.smooth(u, cutoff_px, known), u, cutoff_px)
+            found = _Coarse(known, self.next_start(u, cutoff_px, known), u, cutoff_px)
             no_better += sweep > 1 and found.unknown >= best.unknown
             best = found if sweep < 2 or found.unknown <= best.unknown else best
             if sweep and (found.unknown == 0 or no_better == 2):
@@ -157,7 +163,7 @@ class _FirstMeasurements:
             first = min(first, self.by(0), key=lambda each: each.unknown)
         matched = np.where(first.known[:, None], first.u, np.nan)
         light = light_for(self.pair, on_pixels(self.pair.grid, self.body.mesh, matched), degree)
-        if light != LOCAL or self.is_given:
+        if light != LOCAL:
             return first, light
         local = self.by(light)
         return (first, degree) if local.unknown > first.unknown + lost else (local, light)
@@ -243,9 +249,14 @@ def block_motion(
     if that isn't close to them, a spline through more of them is added. InputError if the blocks
     aren't found.
     """
-    mesh = body.mesh
-    match = _matched(pair, mesh, known, BLOCKS)
+    match = _matched(pair, body.mesh, known, BLOCKS)
     require_same_surface(match, *names)
+    return _closer(pair, body, known, match)
+
+
+def _closer(pair: ImagePair, body: Body, known: FloatArray, match: BlockMatch) -> FloatArray:
+    """(n, 2) known displacement of the nodes, and the motion of blocks relative to it [mm]."""
+    mesh = body.mesh
     added = match.in_mm(pair.grid).less(_at_nearest(mesh, known))
     known = known + _polynomial(mesh, pair, added)
     for times in _DENSER:
