@@ -15,8 +15,6 @@ from sphinx.environment import BuildEnvironment
 SOURCE = Path(__file__).resolve().parents[2] / "src" / "modeharvest"
 COMMANDS = "cli"
 """The package of the commands, which are documented on a separate page."""
-ORDER = ("fem", "imaging", "idic", "validation", "runs", "report", "util")
-"""Packages in the order of the list and the sidebar, which leaves ``modeharvest.`` out."""
 DEPTH = 3
 """Levels in an API page's contents: the package, its modules, their classes and functions."""
 
@@ -77,17 +75,16 @@ def draw(app: Sphinx) -> None:
     folder = Path(app.srcdir) / FOLDER / "api"
     write(folder / "modeharvest.rst", public_names())
     listed = "- :doc:`modeharvest </generated/api/modeharvest>`: what most scripts need.\n"
-    contents = "\n.. toctree::\n   :hidden:\n   :maxdepth: 1\n\n   /generated/api/modeharvest\n"
-    for name, modules in sorted(packages().items(), key=lambda p: ORDER.index(p[0].split(".")[1])):
+    for name, modules in packages().items():
         init = SOURCE.parent.joinpath(*name.split("."), "__init__.py")
         defines = any(isinstance(n, ast.FunctionDef) for n in ast.parse(init.read_text()).body)
-        page = heading(name) + (f".. automodule:: {name}" if defines else first_line(init))
+        page = heading(name.partition(".")[2]) + f"Package ``{name}``.\n\n"  # no word to break
+        page += f".. automodule:: {name}" if defines else first_line(init)
         for module in modules:
             page += "\n\n" + heading(module, "-") + f".. automodule:: {name}.{module}"
         write(folder / f"{name}.rst", page + "\n")
         listed += f"- :doc:`{name} </generated/api/{name}>`: {first_line(init)}\n"
-        contents += f"   {name.partition('.')[2]} </generated/api/{name}>\n"
-    write(folder / "packages.inc", listed + contents)
+    write(folder / "packages.inc", listed)
 
 
 def shorten_contents(_: Sphinx, env: BuildEnvironment) -> None:
