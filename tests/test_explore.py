@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -454,6 +455,28 @@ def test_it_fits_a_telephone(tab: Tab) -> None:
         _, _, width, _ = box(tab)
         assert 250 < width <= 420
     finally:
+        tab.resize(1280, 900)
+
+
+@pytest.mark.parametrize("width", [500, 860, 1280])
+def test_pictures_of_a_row_are_at_one_height_and_apart(tab: Tab, width: int) -> None:
+    """Of six photographs: their headings wrapped in some, and pictures lay on their neighbours."""
+    tab.resize(width, 900)
+    tab.run("(row => { const one = row.firstElementChild; row.dataset.test = '';"
+            " for (let k = 0; k < 5; k++) row.append(one.cloneNode(true));"
+            " [...row.children].forEach((f, k) => { f.querySelector('.label').textContent ="
+            " k % 2 ? 'A long heading that wraps to two lines or to three' : 'A'; }); })"
+            "(document.querySelector('#fluc1x-0500').parentElement)")  # fmt: skip
+    try:
+        boxes = tab.run("[...document.querySelectorAll('[data-test] svg')].map(e =>"
+                        " (r => [r.left, r.right, r.top])(e.getBoundingClientRect()))")  # fmt: skip
+        assert len(boxes) >= 6
+        for (_, right, top), (left, _, beside) in pairwise(boxes):
+            assert abs(top - beside) < 0.5 or beside > top + 50.0
+            assert right < left or beside > top
+    finally:
+        tab.run("(row => { while (row.children.length > 2) row.lastElementChild.remove();"
+                " delete row.dataset.test; })(document.querySelector('[data-test]'))")  # fmt: skip
         tab.resize(1280, 900)
 
 
