@@ -415,7 +415,7 @@
       const pair = data.quantities.some((q) => q.truth.length), none = pair && shared.truth && !this.showsTruth;
       this.tag.hidden = !pair || !(shared.truth || blinking);
       this.tag.className = `ex-tag ${none ? "none" : this.showsTruth ? "" : "measured"}`;
-      this.tag.textContent = none ? "measured, has no truth" : this.showsTruth ? "truth" : "measured";
+      this.tag.textContent = none ? "has no truth" : this.showsTruth ? "truth" : "measured";
       const which = this.showsTruth ? "truth" : "measured";
       this.over.setAttribute("aria-label", `${this.spec.title}, ${data.states[this.state].label}, ${which}`);
       $(".ex-unit", this.element).textContent = unit || "–";
