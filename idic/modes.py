@@ -309,7 +309,7 @@ class FourierMode:
         return cls(family, half_wavelength, _LARGEST / largest, taper)
 
     def evaluate(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
-        """(..., 2): phi [-] along x and y, at positions [mm] that broadcast together."""
+        """(..., 2): phi [-] of parameters (p,), at positions x, y [mm] that broadcast together."""
         taper_x, taper_y = self.scale * self.taper.along_x(x), self.taper.along_y(y)
         return self._weighted_sum(parameters, x, y, taper_x, taper_y)
 

@@ -124,7 +124,7 @@ class Camera:
 
     @classmethod
     def of(cls, spec: ImagingSpec, shape: tuple[int, int], folder: Path) -> Camera:
-        """The camera of a specification, for images of (rows, cols) pixels."""
+        """The camera of a specification; images of (rows, cols) pixels are written to a folder."""
         lens = spec.lens(shape)
         return cls(spec, None if lens is None else ideal_points(lens, shape), folder)
 

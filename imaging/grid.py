@@ -38,7 +38,7 @@ class PixelGrid:
 
     @classmethod
     def centred(cls, rows: int, cols: int, pixel_size: float) -> PixelGrid:
-        """Make the grid whose image centre is at the physical origin."""
+        """Make the grid of pixels of an edge [mm] whose image centre is at the physical origin."""
         x0, y0 = -0.5 * (cols - 1) * pixel_size, 0.5 * (rows - 1) * pixel_size
         return cls(rows, cols, pixel_size, x0, y0)
 

@@ -102,7 +102,7 @@ class Truth:
         return self.part("residual_px")
 
     def write(self, path: Path | str, nominal_strain: float, grid: PixelGrid) -> None:
-        """Write a truth file atomically."""
+        """Write a truth file, atomically, of the pixels of a grid at a nominal strain [-]."""
         with atomic_hdf5(path) as file:
             file.attrs.update(format=TRUTH_FORMAT, nominal_strain=nominal_strain, **asdict(grid))
             for name, (unit, meaning) in _PARTS.items():

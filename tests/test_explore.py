@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -321,7 +322,13 @@ def test_colours_have_the_reader_s_limits(tab: Tab) -> None:
     assert tab.run("explorer.panels[0].ends") == pytest.approx([-0.05, 0.12])
     assert tab.run("explorer.panels[1].ends") != pytest.approx([-0.05, 0.12])
     tab.run("(p => { p.low.value = 'nonsense'; p.setLimits(); })(explorer.panels[0])")
-    assert tab.run("explorer.panels[0].low.getAttribute('aria-invalid')") == "true"
+    invalid = "explorer.panels[0].low.getAttribute('aria-invalid')"
+    border = "(p => getComputedStyle(p.low).borderColor == getComputedStyle(p.high).borderColor"
+    other = f"{border} && getComputedStyle(p.low).borderColor)(explorer.panels[0])"
+    assert tab.run(invalid) == "true"
+    assert tab.run(other) != tab.run(other.replace("panels[0]", "panels[1]"))
+    tab.run("explorer.draw().then(() => 0)")  # which shows the limits that hold
+    assert tab.run(invalid) == "false"
     assert tab.run("explorer.panels[0].ends") == pytest.approx([-0.05, 0.12])
     tab.run("explorer.panels[0].element.querySelector('.ex-auto').click()")
     assert tab.run("explorer.panels[0].ends") == auto
@@ -360,6 +367,51 @@ def test_saved_files_hold_the_field(tab: Tab, downloads: Path, content: Any) -> 
     assert saved(tab, downloads, f"ux-{state}.png")[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+def test_a_click_off_the_material_fixes_nothing(tab: Tab) -> None:
+    left, top, width, height = box(tab)
+    tab.click(left + 0.01 * width, top + 0.01 * height)
+    tab.mouse(left + 0.35 * width, top + 0.3 * height)
+    assert np.isfinite(value_of(tab))
+    tab.press("Escape")
+    tab.press("Enter")
+    tab.mouse(left + 0.36 * width, top + 0.3 * height)
+    assert np.isfinite(value_of(tab))
+
+
+def test_two_fingers_zoom_and_move(tab: Tab) -> None:
+    tab.run("explorer.setView(2, 0, 0).then(() => 0)")
+    left, top, width, height = box(tab)
+    x, y = left + 0.5 * width, top + 0.4 * height
+
+    def touch(kind: str, apart: float, down: float) -> None:
+        points = [{"x": x + side * apart, "y": y + down, "id": side + 1} for side in (-1, 1)]
+        tab.send("Input.dispatchTouchEvent", type=kind, touchPoints=points if apart else [])
+
+    def under(down: float) -> list[float]:
+        at = f"0.5 * p.map.width, 0.4 * p.map.height + {down}"
+        return list(tab.run(f"explorer.draw().then(() => (p => p.toMm({at}))(explorer.panels[0]))"))
+
+    before = under(0)
+    touch("touchStart", 30, 0)
+    for k in range(1, 11):
+        touch("touchMove", 30 + 3 * k, 4 * k)
+    touch("touchEnd", 0, 0)
+    zoom = tab.run("explorer.shared.zoom")
+    assert zoom > 3.0
+    scale = tab.run("explorer.panels[0].transform().s")
+    assert under(40) == pytest.approx(before, abs=10 / scale)
+
+
+def test_keys_work_from_buttons_and_leave_the_browser_its_own(tab: Tab) -> None:
+    tab.run("document.querySelector('[data-do=all]').focus()")
+    tab.press("+")
+    assert tab.run("explorer.shared.zoom") == pytest.approx(1.5)
+    for where in ("document.activeElement", "explorer.panels[0].over"):
+        how = "{key: '+', ctrlKey: true, cancelable: true, bubbles: true}"
+        assert tab.run(f"{where}.dispatchEvent(new KeyboardEvent('keydown', {how}))")
+    assert tab.run("explorer.shared.zoom") == pytest.approx(1.5)
+
+
 def test_it_works_by_keys_and_speaks(tab: Tab, content: Any) -> None:
     tab.run("explorer.panels[0].over.focus()")
     tab.press("ArrowRight")
@@ -372,6 +424,9 @@ def test_it_works_by_keys_and_speaks(tab: Tab, content: Any) -> None:
     spoken = tab.run("document.getElementById('ex-live').textContent")
     assert "Displacement u along x: " in spoken
     assert f"row {after[0]}" in spoken
+    nodes = tab.send("Accessibility.getFullAXTree")["nodes"]
+    spoken_alone = [node for node in nodes if node.get("role", {}).get("value") == "status"]
+    assert len(spoken_alone) == 2  # the state, and position with values: nothing is read twice
     for key, zoom in (("+", 1.5), ("+", 2.25), ("-", 1.5), ("0", 1.0)):
         tab.press(key)
         assert tab.run("explorer.shared.zoom") == pytest.approx(zoom)
@@ -400,6 +455,28 @@ def test_it_fits_a_telephone(tab: Tab) -> None:
         _, _, width, _ = box(tab)
         assert 250 < width <= 420
     finally:
+        tab.resize(1280, 900)
+
+
+@pytest.mark.parametrize("width", [500, 860, 1280])
+def test_pictures_of_a_row_are_at_one_height_and_apart(tab: Tab, width: int) -> None:
+    """Of six photographs: their headings wrapped in some, and pictures lay on their neighbours."""
+    tab.resize(width, 900)
+    tab.run("(row => { const one = row.firstElementChild; row.dataset.test = '';"
+            " for (let k = 0; k < 5; k++) row.append(one.cloneNode(true));"
+            " [...row.children].forEach((f, k) => { f.querySelector('.label').textContent ="
+            " k % 2 ? 'A long heading that wraps to two lines or to three' : 'A'; }); })"
+            "(document.querySelector('#fluc1x-0500').parentElement)")  # fmt: skip
+    try:
+        boxes = tab.run("[...document.querySelectorAll('[data-test] svg')].map(e =>"
+                        " (r => [r.left, r.right, r.top])(e.getBoundingClientRect()))")  # fmt: skip
+        assert len(boxes) >= 6
+        for (_, right, top), (left, _, beside) in pairwise(boxes):
+            assert abs(top - beside) < 0.5 or beside > top + 50.0
+            assert right < left or beside > top
+    finally:
+        tab.run("(row => { while (row.children.length > 2) row.lastElementChild.remove();"
+                " delete row.dataset.test; })(document.querySelector('[data-test]'))")  # fmt: skip
         tab.resize(1280, 900)
 
 

@@ -26,7 +26,7 @@ from modeharvest.report.experiment import (
     snapshot_panels,
 )
 from modeharvest.report.figures import fits
-from modeharvest.report.model.content import KeyNumber, ReportTable
+from modeharvest.report.model.content import Card, KeyNumber, Report, ReportTable, Section
 from modeharvest.report.model.output import draw_figures, print_report, write_page
 from modeharvest.report.model.text import Measured, fixed, indexed, number, text_of, typeset
 
@@ -263,6 +263,24 @@ def test_the_table_on_the_terminal_fits_80_columns(
     assert all(len(row) <= 80 and row[0] != " " for row in rows)  # a wrapped row begins blank
     assert any(row.startswith("measurement error, rms [px] ") for row in rows)
     assert 3 <= len(rows) <= 10
+
+
+@pytest.mark.parametrize("images", [7, 20])
+def test_no_word_of_a_wide_table_is_cut(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, images: int
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    heads = ["image", *(f"quantity_{k:02} [px]" for k in range(9))]
+    rows = [[f"frame_{n:04}", *(float(10 * n + k) for k in range(9))] for n in range(images)]
+    cards = Card.tabular(ReportTable("Images", heads, rows, on_terminal=True))
+    print_report(Report("kind", "title", sections=[Section("s", "S", cards)]), Path("out"))
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert text.count("Images") == 1
+    words = text.split()
+    for name, *values in rows:
+        assert name in words
+        assert all(number(value) in words for value in values)
 
 
 def test_fixed_numbers_have_no_minus_before_zero() -> None:

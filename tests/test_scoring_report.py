@@ -26,6 +26,7 @@ from modeharvest.cli.root import main
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.report.model.text import number
+from modeharvest.runs import benchmark
 from modeharvest.validation.scoring import score as grades
 from modeharvest.validation.scoring import score as spectra
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
@@ -134,12 +135,17 @@ def test_files_and_page_tell_the_same(command: tuple[Path, str, int]) -> None:
     assert "report.html" in message
 
 
-def test_no_number_is_not_a_number_in_json(command: tuple[Path, str, int]) -> None:
+def test_regions_without_points_are_null_in_json(truth: BenchmarkTruth, tmp_path: Path) -> None:
     def refuse(name: str) -> None:
         raise AssertionError(name)
 
-    text = (command[0] / "out" / "scores.json").read_text("utf-8")
-    json.loads(text, parse_constant=refuse)
+    write_field(tmp_path / "one.csv", noisy(truth, 0.1, "one"))
+    benchmark.score([tmp_path / "one.csv"], truth.folder, STRAIN, tmp_path / "out", edge_px=1000)
+    text = (tmp_path / "out" / "scores.json").read_text("utf-8")
+    (field,) = json.loads(text, parse_constant=refuse)["fields"]
+    assert field["edges"]["rms_px"] > 0.0
+    assert field["bulk"]["rms_px"] is None
+    assert field["bulk"]["bias_px"] == [None, None]
 
 
 def test_where_all_measure_is_where_the_sparse_one_does(command: tuple[Path, str, int]) -> None:

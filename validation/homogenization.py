@@ -121,7 +121,7 @@ class LatticeMode:
     def of_waves(
         cls, found: PlaneWaves, vectors: ArrayLike, about: ArrayLike = (0.0, 0.0)
     ) -> LatticeMode:
-        """As :meth:`of`, from waves in the lattice's coordinates; phases are kept at ``about``."""
+        """As :meth:`of`, from waves in the lattice's coordinates; phases stay at ``about`` [mm]."""
         mode_found = cls(found, snapped(found, vectors, about, inversion_centre=(0.0, 0.0)))
         as_found = snapped(found, vectors, about)
         a, b = (np.stack([w.cosine, w.sine]).ravel() for w in (mode_found.snapped, as_found))

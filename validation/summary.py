@@ -46,7 +46,7 @@ class Expectation:
     def at_most(
         cls, quantity: str, obtained: float, limit: float, unit: str, source: str = REQUIREMENT
     ) -> Expectation:
-        """Expect a number to be at most ``limit``."""
+        """Expect a number to be at most ``limit``, in the same unit; ``source`` of the limit."""
         return cls(quantity, obtained, f"≤ {limit:g}", obtained <= limit, unit, source)
 
 
@@ -258,7 +258,7 @@ def experiment_summary(
 def displacement_spectrum(
     comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
 ) -> tuple[Spectrum, mode_pattern.WavePattern]:
-    """Spectral densities of the k-th true displacement, and the pattern read from them."""
+    """Spectral densities [mm⁶] of the k-th true displacement, and the pattern read from them."""
     at, pitch = comparisons[k], measured.specimen.pitch
     spectrum = spectral_density(at.displacement, at.grid, at.mask, pitch)
     return spectrum, mode_pattern.read_pattern(spectrum)

@@ -78,7 +78,8 @@ def draw(app: Sphinx) -> None:
     for name, modules in packages().items():
         init = SOURCE.parent.joinpath(*name.split("."), "__init__.py")
         defines = any(isinstance(n, ast.FunctionDef) for n in ast.parse(init.read_text()).body)
-        page = heading(name) + (f".. automodule:: {name}" if defines else first_line(init))
+        page = heading(name.partition(".")[2]) + f"Package ``{name}``.\n\n"  # no word to break
+        page += f".. automodule:: {name}" if defines else first_line(init)
         for module in modules:
             page += "\n\n" + heading(module, "-") + f".. automodule:: {name}.{module}"
         write(folder / f"{name}.rst", page + "\n")

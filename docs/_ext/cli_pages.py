@@ -11,13 +11,21 @@ import typer
 from rst import FOLDER, heading, table, write
 from sphinx.application import Sphinx
 
+# A command in bold type, in quotes, or as an example; an option: two dashes of text become one.
+LITERAL = re.compile(
+    r"\[bold\](.*?)\[/bold\]|'(modeharvest [^']*)'|(?<=For example: )(modeharvest .*)"
+    r"|(?<![\w-])(--[a-z]+(?:-[a-z]+)*(?:=\w+)?)"
+)
+
 
 def plain(text: str | None) -> str:
-    """Help text without marks for bold type, escaped for reStructuredText."""
-    text = re.sub(r"\[/?bold\]", "", text or "")
-    text = re.sub(r"([*_`|\\])", r"\\\1", text)
-    # Outside literals, two dashes would be shown as one.
-    return re.sub(r"(?<![\w-])(--[a-z]+(?:-[a-z]+)*(?:=\w+)?)", r"``\1``", text)
+    """Help text in reStructuredText, with commands and options as literals."""
+    parts = LITERAL.split(text or "")  # text, and a literal in one of four groups, in turn
+    made = [re.sub(r"([*_`|\\])", r"\\\1", part) for part in parts[::5]]
+    found = [next(filter(None, parts[k : k + 4])) for k in range(1, len(parts), 5)]
+    for k, literal in enumerate(found):
+        made[k] += f"``{' '.join(literal.split())}``"
+    return "".join(made)
 
 
 def parameters(command: Any) -> Iterator[tuple[str, str, str]]:

@@ -226,7 +226,7 @@ class PeriodicCell:
     def equilibrium(
         self, loading: MacroLoading, load: float, near: CellState | None = None
     ) -> CellState | None:
-        """The equilibrium at a load, from a nearby state; None if not found, or not admissible."""
+        """The equilibrium at a load [-], from a state nearby; None if not found or admissible."""
         guess: FloatArray = np.concatenate([np.eye(2).ravel(), np.zeros(self.reduction.size)])
         if near is not None:
             guess = near.value + (load - near.load) * near.rate

@@ -118,7 +118,10 @@ def field_names(given: Given = NO_MORE) -> list[str]:
 def field_at(
     result: NodalResult, name: str, where: Where = None, given: Given = NO_MORE
 ) -> FloatArray:
-    """Evaluate one field at nodes (n, ...), at pixels (rows, cols, ...) or at points (k, ...)."""
+    """Evaluate one field at nodes (n, ...), at pixels (rows, cols, ...) or at points (k, ...).
+
+    ``name``: one of :func:`field_names`. Raises InputError if the field needs what isn't given.
+    """
     if name == "displacement":
         return result.values_at(result.displacement, where)
     if name == "standard_deviation":

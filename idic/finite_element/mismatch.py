@@ -38,7 +38,7 @@ deviation; they count nevertheless if they are a larger share of the material.""
 _SPECK, _OF_SPECKLE, _ROUNDS = 6, 0.25, 3
 """So many connected pixels that differ don't count, either, and a square of this share of a speckle
 at least; largest number of searches. Residuals of displacements that aren't resolved exceed the
-limit in up to 5 connected pixels of speckle of 4 px."""
+limit in a few connected pixels."""
 _SAMPLED = 200_000
 _EVERY = 8
 """Pixels from which noise is estimated; or one of so many."""

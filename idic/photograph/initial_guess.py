@@ -338,7 +338,7 @@ def with_fixed_modes(ansatz: Ansatz, unknowns: FloatArray) -> tuple[Ansatz, Floa
 def shows_more(
     now: Ansatz, unknowns: FloatArray, before: Ansatz, unknowns_before: FloatArray
 ) -> bool:
-    """Whether a part of the specimen shows a wave that it did not show before."""
+    """Whether ``now``, with its unknowns (n,), has a wave in a part that ``before`` lacks there."""
     known = _waves(before, unknowns_before)
     return not all(
         any(

@@ -214,7 +214,7 @@ def found_modes(
     pair: ImagePair, geometry: Geometry, cell_size: float, how: PhotographOptions,
     local: LocalField | None, holes: LocalField | None = None,
 ) -> tuple[InitialGuess, Ansatz, FloatArray, tuple[str, ...]]:  # fmt: skip
-    """Find an initial guess, the ansatz and unknowns chosen from it, and a text about them."""
+    """Find a guess for holes ``cell_size`` [mm] apart; ansatz, unknowns (n,) and text from it."""
     region = geometry.region
     lower = for_cells(how, region.domain, region.cellular, cell_size)
     guess = initial_guess(

@@ -164,7 +164,7 @@ class LevelSearch:
         )
 
     def equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
-        """Normal equations at some unknowns."""
+        """Normal equations of the pair's images at unknowns (n,), with their matrix or without."""
         return assembly.images(a, self.pair.reference, self.pair.deformed, with_matrix)
 
 

@@ -24,8 +24,8 @@ _BLUR_PX, _BORDER_PX = 0.7, 2
 to the picture's border don't count then."""
 _SHARP = 0.06
 """Power of the finest details at edges, over the speckle's variance, times its size [px], above
-which edges are sharp: 0.07 to 0.22 for sharp paint of 4 to 12 px, with or without noise, at most
-0.02 for random fields, correlated noise and JPEGs."""
+which edges are sharp: between that of sharp paint and that of random fields, with or without noise
+(tests/test_whole_measure.py)."""
 
 
 def well_sampled(pair: ImagePair, speckle_px: float) -> ImagePair:

@@ -40,7 +40,7 @@ def coefficients(a: FloatArray) -> Coefficients:
 
 @compiled(inline=True, relaxed=True)
 def value(a: Coefficients, curved: bool, s: float, t: float) -> float:
-    """Evaluate a polynomial; ``curved``: it has terms of total degree 3 and 4."""
+    """Evaluate a polynomial at (s, t) [-]; ``curved``: it has terms of total degree 3 and 4."""
     p = a[0] + s * (a[1] + s * a[3] + t * a[4]) + t * (a[2] + t * a[5])
     if curved:
         p += s * t * (s * a[6] + t * a[7] + s * t * a[8])
@@ -264,7 +264,7 @@ def start_cubic(
     polynomial: FloatArray, curved: bool, low: End, high: End, col: float, s: FloatArray,
     t: FloatArray,
 ) -> None:  # fmt: skip
-    """Initial guesses for the pixels col, col + 1, ... of a row between its two ends."""
+    """Write initial guesses (k,) s, t of the pixels col, col + 1, ... of a row between its ends."""
     length = max(high[0] - low[0], 1e-3)
     ds_low, dt_low = _along_row(polynomial, curved, low[1], low[2])
     ds_high, dt_high = _along_row(polynomial, curved, high[1], high[2])

@@ -58,7 +58,10 @@ class VariedFactor:
 
     @classmethod
     def option(cls, label: str, path: str, levels: tuple[float, ...], **kind: Any) -> Self:
-        """A factor for the option at a dotted path of a :class:`StudySetting`."""
+        """A factor, shown as ``label``, for the option at a dotted path of a :class:`StudySetting`.
+
+        ``levels``: values of the option; ``kind``: further fields of the factor.
+        """
         at, _, name = path.rpartition(".")
         value = attrgetter(path)
         return cls(label, levels, lambda s, v: changed(s, at, **{name: v}), value, **kind)

@@ -136,7 +136,7 @@ class TransferCurves:
         return cls(periods, own, whole)
 
     def at(self, part: str, axis: int, degree: int, period: float) -> float:
-        """T of a wave in its own part at a period [mm]."""
+        """T [-] of a wave along an axis in its own part, "v0" or "v1", at a period [mm]."""
         return float(np.interp(period, self.periods, self.own[part, axis, degree]))
 
     def finest(self, part: str, axis: int, degree: int) -> float:

@@ -362,7 +362,7 @@ class LinearisedBody:
         self.moduli = moduli.reshape(-1, count, count)
 
     def moved(self, dy: FloatArray, change: float, relax: bool = True) -> FloatArray:
-        """Change of the whole state for changes of y and load; ``relax``: RVEs to equilibrium."""
+        """Change of y and of RVEs' states for one of y and load [-]; ``relax``: to equilibrium."""
         body = self.body
         da = body.T @ dy + change * body.direction
         dq = np.einsum("cpsd,cd->cps", body.regions[0].B, da[body.regions[0].dofs])

@@ -279,8 +279,8 @@ def measure(
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
 
-    Images are TIFF, PNG or JPEG files of one size, folders, or videos. Specimens without speckle
-    are measured by their contours if they are fully visible. Writes displacement, standard
+    Images are TIFF, PNG, JPEG or BMP files of one size, folders, or videos. Specimens without
+    speckle are measured by their contours if they are fully visible. Writes displacement, standard
     deviations and strains (HDF5, VTU, CSV, TIFF), report.html and summary.json to DIR. After an
     interruption run the same command again: it continues.
 

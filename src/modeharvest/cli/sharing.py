@@ -51,7 +51,7 @@ def standard(
         Path | None, folder_option("--truth", "Folder for the truth [DIR-truth].")
     ] = None,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, help="0: the open set; a large one: a blind set.")
+        int, typer.Option("--seed", min=0, help="0: the open set. A large secret one: a blind set.")
     ] = 0,
 ) -> None:
     """Make the standard set: twelve cases that vary specimen, d/l, noise, speckle, pixels, lens."""

@@ -405,15 +405,17 @@
 
     labels() {
       const [unit, factor] = unitOf(this.spec), [low, high] = this.ends;
-      this.low.value = written(low * factor, 3);
-      this.high.value = written(high * factor, 3);
+      for (const [input, end] of [[this.low, low], [this.high, high]]) {
+        input.value = written(end * factor, 3);
+        input.setAttribute("aria-invalid", "false");
+      }
       const ramp = $(".ex-ramp canvas", this.element).getContext("2d"), image = ramp.createImageData(256, 1);
       image.data.set(this.lut);
       ramp.putImageData(image, 0, 0);
       const pair = data.quantities.some((q) => q.truth.length), none = pair && shared.truth && !this.showsTruth;
       this.tag.hidden = !pair || !(shared.truth || blinking);
       this.tag.className = `ex-tag ${none ? "none" : this.showsTruth ? "" : "measured"}`;
-      this.tag.textContent = none ? "measured, has no truth" : this.showsTruth ? "truth" : "measured";
+      this.tag.textContent = none ? "has no truth" : this.showsTruth ? "truth" : "measured";
       const which = this.showsTruth ? "truth" : "measured";
       this.over.setAttribute("aria-label", `${this.spec.title}, ${data.states[this.state].label}, ${which}`);
       $(".ex-unit", this.element).textContent = unit || "–";
@@ -621,15 +623,16 @@
       if (others.length) {
         const other = others[0][1], apart = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]) || 1;
         zoomAt(panel, apart(now) / apart(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
-      } else {
-        const per = devicePixelRatio / panel.transform().s;
-        setView(shared.zoom, shared.x - (now[0] - before[0]) * per, shared.y + (now[1] - before[1]) * per);
       }
+      // Of two fingers the point between them is dragged: it moves by half of what each does.
+      const per = devicePixelRatio / panel.transform().s / (others.length ? 2 : 1);
+      setView(shared.zoom, shared.x - (now[0] - before[0]) * per, shared.y + (now[1] - before[1]) * per);
     });
     const release = (event) => {
       if (touches.delete(event.pointerId) && event.type === "pointerup" && moved < 4) {
-        shared.fixed = event.pointerType !== "mouse" || !shared.fixed;
-        point(panel.sampleAt(event.clientX, event.clientY), true);
+        const found = panel.sampleAt(event.clientX, event.clientY);
+        shared.fixed = found !== null && (event.pointerType !== "mouse" || !shared.fixed);
+        point(found, true);
       }
       over.classList.remove("dragging");
     };
@@ -642,14 +645,16 @@
       event.preventDefault();
       zoomAt(panel, Math.exp(-0.0016 * event.deltaY), event.clientX, event.clientY);
     }, { passive: false });
-    over.addEventListener("keydown", (event) => key(panel, event));
   };
 
   const ARROWS = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] };
-  const key = (panel, event) => {
-    const arrow = ARROWS[event.key];
+  /** Keys with a map in focus, or a button, which has arrows and Enter for itself. */
+  const key = (event) => {
+    const panel = panels.find(({ over }) => over === event.target);
+    if (event.target.matches("select, input")) return;
+    const arrow = panel && ARROWS[event.key];
     const step = { "+": "in", "=": "in", "-": "out", 0: "all", "[": "previous", "]": "next" }[event.key];
-    if (event.altKey || event.metaKey) return;
+    if (event.altKey || event.metaKey || (event.ctrlKey && !arrow)) return; // the browser's own
     if (arrow && event.shiftKey) {
       const far = 0.15 * (box[1] - box[0]) / shared.zoom;
       setView(shared.zoom, shared.x + arrow[1] * far, shared.y - arrow[0] * far);
@@ -659,7 +664,7 @@
       const c = Math.min(cols - 1, Math.max(0, (i % cols) + far * arrow[1]));
       shared.fixed = true;
       point(r * cols + c, true);
-    } else if (event.key === "Enter") { shared.fixed = !shared.fixed; point(shared.at, true); }
+    } else if (panel && event.key === "Enter") { shared.fixed = shared.at !== null && !shared.fixed; point(shared.at, true); }
     else if (event.key === "Escape") { shared.fixed = false; point(null); }
     else if (event.key === "b" || event.key === "B") acts[shared.truth ? "measured" : "truth"]();
     else if ((event.key === "d" || event.key === "D") && hasMotion) reshape(shared.shape ? 0 : 1);
@@ -672,7 +677,7 @@
   const middle = (panel) => {
     const { width: W, height: H } = panel.map;
     let best = 0, least = Infinity;
-    for (let p = 0; p < panel.index.length; p++) {
+    for (let p = 0; panel.shown && p < panel.index.length; p++) {
       const i = panel.index[p], away = (p % W - W / 2) ** 2 + (Math.floor(p / W) - H / 2) ** 2;
       if (i >= 0 && away < least && panel.shown.known[i]) [best, least] = [i, away];
     }
@@ -782,6 +787,7 @@
     $("#ex-shape").onchange = (event) => reshape(Number(event.target.value));
     $("#ex-unit").onchange = (event) => { shared.unit = Number(event.target.value); draw(); };
     $("#ex-count").onchange = (event) => arrange(Number(event.target.value));
+    root.addEventListener("keydown", key);
     for (const button of $$("[data-do]")) button.onclick = () => acts[button.dataset.do]();
     const steps = Object.values(data.states.at(-1).arrays).map((k) => data.packed[k].step);
     $("#ex-step").textContent = data.quantities[0].unit === "length"

@@ -182,4 +182,4 @@ def _residual_cards(
             draw = partial(draw_field, frame, field, ColourScale.signed(field, unit, 0.999))
             figures.append(ReportFigure(f"residual-{k}", f"{100 * state.strain:.4g} %", draw))
     text = text_of("identified-residual")
-    return [Card("Residual f − g(x + u)", figures, caption=text)] if figures else []
+    return [Card("Residual f(x) − g(x + u)", figures, caption=text)] if figures else []

@@ -119,17 +119,17 @@ def _cards(
     sd = np.linalg.norm(result.standard_deviation, axis=1)
     panels: dict[str, list[tuple[str, Callable[[], Figure]]]] = {
         "Displacement": [("along " + "xy"[c], partial(nodal, u[:, c], unit)) for c in (0, 1)],
+        "Standard deviation of u, both components": [("", partial(nodal, sd, unit, False))],
         "Logarithmic strain": [
             (f"{'xy'[i]}{'xy'[j]}", partial(nodal, strain[:, i, j], "strain [-]"))
             for i, j in ((0, 0), (1, 1), (0, 1))
         ],
-        "Standard deviation of u, both components": [("", partial(nodal, sd, unit, False))],
         "Deformed image, with the mesh’s edges as measured": [("", seen)],
     }
     if result.shown == "speckle":
-        panels["Residual f − g(x + u)"] = [("", left)]
+        panels["Residual f(x) − g(x + u)"] = [("", left)]
     return [
         Card(title, [ReportFigure(f"map-{k + 1}-{n}-{m}", label, draw)
-                     for m, (label, draw) in enumerate(figures)])
+                     for m, (label, draw) in enumerate(figures)], wide=len(figures) > 2)
         for n, (title, figures) in enumerate(panels.items())
     ]  # fmt: skip

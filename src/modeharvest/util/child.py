@@ -58,7 +58,7 @@ KINDS = {"mat": read_mat, "mesh": read_mesh}
 
 
 def convert(kind: str, path: str, target: str) -> str:
-    """Read ``path`` and write ``target``; returns why that failed, or an empty text."""
+    """Read ``path``, of one of ``KINDS``, and write NPZ; returns why that failed, or ""."""
     output = StringIO()
     try:
         with warnings.catch_warnings(), redirect_stdout(output), redirect_stderr(output):

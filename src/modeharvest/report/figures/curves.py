@@ -212,7 +212,7 @@ def curve(
     box = (left / width, below / height, 1.0 - (left + 0.1) / width, 1.0 - (below + 0.2) / height)
     axes = drawn.add_axes(box)
     axes.set_xlabel(x)
-    axes.set_ylabel(y, labelpad=2)
+    axes.set_ylabel(y, labelpad=4)
     axes.grid(color=MUTED, alpha=0.18, lw=0.6)
     axes.set_axisbelow(True)
     return drawn, axes
@@ -297,7 +297,7 @@ def draw_waves(frames: Sequence[dict[str, Any]]) -> Figure:
     or model error, whichever is larger. Filled markers: free and observable parameters.
     """
     drawn, axes = curve(
-        "nominal strain [%]", "components of the wave vectors, |ξ| [1/l]", left=0.74
+        "nominal strain [%]", "components of the wave vectors, |ξ| [1/l]", left=0.78
     )
     for number, (label, points) in enumerate(_components(frames).items()):
         strain, value, sd, free = np.array(points, dtype=np.float64).T

@@ -203,7 +203,7 @@ def draw_w(state: PhotographState) -> Figure:
 
 
 def has_error(state: PhotographState, name: str, i: int, cause: str) -> bool:
-    """Whether the standard deviation that :func:`draw_error` draws is known."""
+    """Whether the standard deviation is known that :func:`draw_error` draws for the same."""
     return _errors(state, cause) is not None and (name == "v0" or fits.has_mode(i)(state))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
@@ -103,18 +103,39 @@ def print_report(report: Report, out: Path) -> None:
         console.print(f"- {escape(text)}", soft_wrap=True)
     brief = [report.brief] if report.brief else []
     for table in (*brief, *(table for table in report.tables if table.on_terminal)):
-        console.print()
-        shown = Table(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD,
-                        show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))  # fmt: skip
         lines: list[Sequence[Cell]] = [table.columns, *table.rows]
         is_wide = len(lines) < len(lines[0])  # few long rows are transposed to fit
-        heads, *rows = zip(*lines, strict=True) if is_wide else lines
-        for n, head in enumerate(map(number, heads)):
-            shown.add_column(escape(head), justify="right" if n else "left", overflow="fold")
-        for row in rows:
-            shown.add_row(*(escape(number(cell)) for cell in row))
-        console.print(shown)
+        columns = lines if is_wide else list(zip(*lines, strict=True))
+        texts = [[number(cell) for cell in column] for column in columns]
+        for k, part in enumerate(_fitting(texts, console.width)):
+            console.print()
+            title = None if k else escape(table.title)
+            shown = Table(title=title, title_justify="left", box=SIMPLE_HEAD,
+                          show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))  # fmt: skip
+            for n, column in enumerate(part):
+                shown.add_column(escape(column[0]), justify="right" if n else "left",
+                                 overflow="fold")  # fmt: skip
+            for row in zip(*(column[1:] for column in part), strict=True):
+                shown.add_row(*map(escape, row))
+            console.print(shown)
     console.print()
     for warning in report.warnings:
         console.print(f"[yellow]warning:[/yellow] {escape(warning)}", soft_wrap=True)
     console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def _fitting(columns: Sequence[list[str]], width: int) -> Iterator[list[list[str]]]:
+    """Columns in parts whose words fit into ``width`` characters; each begins with the first."""
+    first, *others = columns
+    part = [first]
+    for column in others:
+        if len(part) > 1 and sum(map(_least_width, [*part, column])) > width:
+            yield part
+            part = [first]
+        part.append(column)
+    yield part
+
+
+def _least_width(column: Sequence[str]) -> int:
+    """Of a column none of whose words is cut, and of the space beside it [characters]."""
+    return 2 + max(len(word) for cell in column for word in ["", *cell.split(" ")])
