@@ -102,7 +102,7 @@ _BOTH = "", "_speckle"
 _MUCH = 0.01
 _UNEVEN = (
     "The light changed along the material, by {:.0f} %, which is taken for displacement: harvest "
-    "with brightness = {} or {} in [correlation], and light the specimen evenly."
+    "with brightness = {} or {} in [correlation], or with --whole-field; light the specimen evenly."
 )
 _LEFT = (
     "{:.0f} % of the material has left the image: there v0 and v1 are extrapolated, with larger "
@@ -417,7 +417,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             own["w"] = measured_spectrum(w, cell, box)
         out = result.outside_image / max(1, result.pixels + result.outside_image)
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
-        if self._plain is None and out < 0.5:
+        if self._plain is None and out < 0.5 and result.outcome is not Outcome.REFITTED:
             degree = Brightness.of(case.correlation.brightness).degree or 0
             change = uneven_light(pair, result.displacement(), degree, finer := degree + 1)
             left += (_UNEVEN.format(100 * change, finer, finer + 1),) * (change > UNEVEN)
