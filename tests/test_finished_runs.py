@@ -66,7 +66,9 @@ def test_a_run_is_opened_in_the_order_of_the_test(run: Path) -> None:
         FinishedRun.read(run / "a.tif")
 
 
-@pytest.mark.parametrize("form", ["ncorr", "vic2d", "davis", "dice", "matchid", "gom", "aramis", "pyvale"])
+@pytest.mark.parametrize(
+    "form", ["ncorr", "vic2d", "davis", "dice", "matchid", "gom", "aramis", "pyvale"]
+)
 def test_a_run_written_for_another_code_is_read_as_it_was(
     run: Path, tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,11 +31,7 @@ from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.photograph.plain.matching import matched_contours
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain
-from modeharvest.idic.photograph.plain.surface import (
-    away_from_cuts,
-    coat_of_paint,
-    plain_surface,
-)
+from modeharvest.idic.photograph.plain.surface import away_from_cuts, coat_of_paint, plain_surface
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images

@@ -62,11 +62,7 @@ from modeharvest.idic.photograph.gauges import (
 )
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain, write_shapes
-from modeharvest.idic.photograph.plain.surface import (
-    MaterialContours,
-    coat_of_paint,
-    plain_surface,
-)
+from modeharvest.idic.photograph.plain.surface import MaterialContours, coat_of_paint, plain_surface
 from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate

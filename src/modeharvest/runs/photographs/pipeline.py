@@ -59,6 +59,7 @@ from modeharvest.idic.photograph.speckled_edges import (
     measure_by_contours,
 )
 from modeharvest.idic.result import Covariance, Result
+from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum

@@ -325,7 +325,8 @@ def _material(
         require_same_shape(photograph.image, mask, str(photograph.path), str(given))
         return ShownMaterial(mask)
     coat = None if like and like.is_plain else coat_of_paint(photograph.image)
-    plain = None if coat is not None else plain_surface(photograph.image, like and like.mask)
+    where = like.mask if like else None
+    plain = None if coat is not None else plain_surface(photograph.image, where)
     if plain is not None:
         return ShownMaterial(plain.mask, (_PLAIN,), True, plain.warnings)
     found = find_material(photograph.image, window, coat)
