@@ -2,6 +2,7 @@
 
 scripts/env python benchmarks/watch.py            # predictions, 32 seeds
 scripts/env python benchmarks/watch.py --step 0.01 --last 0.7    # a photograph every hundredth
+scripts/env python benchmarks/watch.py --compare  # with other estimators, as a table
 scripts/env python benchmarks/watch.py --time     # time per photograph of 3 Mpx
 scripts/env python benchmarks/watch.py --memory harvest 20 200    # peak memory by photographs
 scripts/env python benchmarks/watch.py --memory measure 20
@@ -22,8 +23,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,7 +46,7 @@ from modeharvest.report.figures.sequence import draw_amplitude, draw_growth
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.watch import QuickMeasurement, WatchedTest
 from modeharvest.util.arrays import FloatArray
-from modeharvest.validation.growth import follow_growth
+from modeharvest.validation.growth import follow_growth, predict
 
 LAST = 0.95
 """Strain up to which photographs are taken, over the specimen's own critical strain [-]."""
@@ -192,6 +194,59 @@ def least_deviation(columns: FloatArray, imperfection: float, critical: float) -
     return float(np.sqrt(np.linalg.inv(information)[0, 0])) / critical
 
 
+def by_southwell_plot(columns: FloatArray) -> float:
+    """The critical load by Southwell's plot: 1 over the slope of a/p against a, weighted."""
+    load, amplitude, sd, _ = columns
+    weight = load / sd
+    line = np.stack([np.ones_like(load), amplitude], axis=1) * weight[:, None]
+    return float(1.0 / np.linalg.lstsq(line, amplitude / load * weight)[0][1])
+
+
+def by_least_squares(columns: FloatArray) -> float:
+    """The critical load by least squares of a = a0 p / (p_c - p) + e, e common to all images."""
+    load, amplitude, sd, _ = columns
+    tried = load.max() * np.geomspace(1.01, 4.0, 600)
+    ahead = load / (tried[:, None] - load)
+    A = np.stack([ahead, np.ones_like(ahead)], axis=2) / sd[:, None]
+    a = amplitude / sd
+    fit = np.linalg.solve(A.mT @ A, (A.mT @ a)[..., None])
+    left = (((A @ fit)[..., 0] - a) ** 2).sum(axis=1)
+    return float(tried[np.argmin(np.where(fit[:, 0, 0] * amplitude[-1] > 0.0, left, np.inf))])
+
+
+def by_posterior(columns: FloatArray) -> float:
+    """The critical load as predicted by the program."""
+    found = predict(columns)
+    return found.critical if found else float("nan")
+
+
+def upper_half(columns: FloatArray) -> FloatArray:
+    """Images at more than half of the largest load."""
+    return columns[:, columns[0] > 0.5 * columns[0].max()]
+
+
+ESTIMATORS: dict[str, Callable[[FloatArray], float]] = {
+    "posterior, as used": by_posterior,
+    "posterior, upper half of the loads": lambda c: by_posterior(upper_half(c)),
+    "Southwell's plot": by_southwell_plot,
+    "Southwell's plot, upper half": lambda c: by_southwell_plot(upper_half(c)),
+    "least squares, no slow part": by_least_squares,
+}
+
+
+def print_compared(tests: Sequence[tuple[FloatArray, float]], shares: FloatArray) -> None:
+    """Print the estimators' errors; ``tests``: columns, and the true critical load."""
+    heads = "estimator", "at", "within 3 %", "rms [%]", "median size [%]", "largest [%]"
+    print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
+    for share, (name, of) in product((0.6, 0.7, 0.8), ESTIMATORS.items()):
+        count = int((shares <= share + 1e-6).sum())
+        off = np.array([100.0 * (of(columns[:, :count]) / there - 1.0) for columns, there in tests])
+        size = np.where(np.isfinite(off), np.abs(off), np.inf)
+        numbers = np.sqrt(np.mean(size**2)), np.median(size), size.max()
+        cells = f"{(size < 3.0).sum()} of {len(off)}", *(f"{value:.1f}" for value in numbers)
+        print(f"| {name} | {share:.0%} | {' | '.join(cells)} |")
+
+
 def print_memory(command: str, counts: Iterable[int]) -> None:
     """Print peak memory, and time per photograph, for each count of photographs."""
     for count in counts:
@@ -270,6 +325,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--memory", nargs="+", metavar=("COMMAND", "COUNT"))
+    parser.add_argument("--compare", action="store_true")
     parser.add_argument("--time", action="store_true")
     parser.add_argument("--seeds", type=int, default=32)
     parser.add_argument("--scatter", type=float, default=0.01)
@@ -287,7 +343,7 @@ def main() -> None:
     if given.time:
         print_times(tuple(np.round(perfect * shares, 4))[::4], given.out)
         return
-    found: list[Checked] = []
+    found, tests = list[Checked](), list[tuple[FloatArray, float]]()
     for seed in range(1, given.seeds + 1):
         experiment = Experiment(imperfection=Imperfection(given.scatter, given.scatter, seed))
         critical = critical_strain(experiment)
@@ -299,11 +355,14 @@ def main() -> None:
         columns = WatchedTest(rows).columns
         # The measured strain is that of the cellular part, without the bulk at its edges.
         there = float(np.polyval(np.polyfit(strains, columns[0], 2), critical))
+        tests.append((columns, there))
         own = list(checked(columns, there, shares))
         found += own
         texts = [f"seed {seed}: {100 * there:.2f} % ({100 * critical:.3f} % nominal);"]
         print("  ".join(texts + [f.text for f in own]), flush=True)
     print_shares(found, given.seeds)
+    if given.compare:
+        print_compared(tests, shares)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import drifting_light
 import manufactured
 import numpy as np
 import pytest
@@ -102,3 +103,18 @@ def test_brightness_survives_a_file(tmp_path: Path) -> None:
 def test_bad_degrees(degrees: tuple[int | None, int | None]) -> None:
     with pytest.raises(InputError, match="degree of gain and offset"):
         Brightness(*degrees)
+
+
+def test_beside_a_spot_of_light_modes_are_those_of_the_whole_displacement(tmp_path: Path) -> None:
+    """A correlation takes the spot for displacement: v0 + v1 phi1 was off by 0.11 px."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drifting_light, "STRAINS", (0.06,))
+        light = drifting_light.LIGHTS["spot30"]
+        run, _ = drifting_light.harvested(tmp_path, lambda _, x, y: light(2, x, y), 1, True)
+        (measured,) = run.results().values()
+    plate, (known, a) = drifting_light.shown(), drifting_light.ansatz_of(0.06)
+    there = known.displacement_at(a, plate.points[plate.mask])
+    off = measured.result.displacement()[plate.mask] - there
+    assert measured.result.outcome is Outcome.REFITTED
+    assert any("The light changed" in text for text in measured.warnings)
+    assert np.sqrt(np.mean(off**2)) < 0.08 * drifting_light.PIXEL

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.io import loadmat
-from scipy.linalg import logm
+from scipy.linalg import logm, sqrtm
 
 from modeharvest.idic.local.export import FORMATS, export_field
 from modeharvest.idic.local.field import LocalField, read_field
@@ -138,6 +138,19 @@ def test_own_formats_hold_gradient_and_strains(
         np.testing.assert_allclose(read[name].ravel()[GOOD], sign * true, rtol=1e-6)
     field = read_field(path, GRID)
     np.testing.assert_allclose(field.u[field.good], U[GOOD], atol=1e-9)
+
+
+def test_aramis_strains_are_those_of_the_right_stretch(tmp_path: Path) -> None:
+    path = strained("aramis", tmp_path)
+    table = columns(path, "; ")
+    technical = np.real(sqrtm(F.T @ F)) - np.eye(2)
+    for name, true in (("epsx [%]", 100.0 * technical[0, 0]), ("epsy [%]", 100.0 * technical[1, 1]),
+                       ("epsxy [1]", technical[0, 1])):  # fmt: skip
+        np.testing.assert_allclose(table[name][GOOD], true, rtol=1e-9)
+    field = read_field(path, GRID)
+    assert field.convention.startswith("GOM/ZEISS ARAMIS: in mm, y up")
+    np.testing.assert_array_equal(field.good, GOOD)
+    np.testing.assert_allclose(field.u[GOOD], U[GOOD], atol=1e-9)
 
 
 def test_codes_without_columns_for_strains_get_none(tmp_path: Path) -> None:

@@ -66,7 +66,9 @@ def test_a_run_is_opened_in_the_order_of_the_test(run: Path) -> None:
         FinishedRun.read(run / "a.tif")
 
 
-@pytest.mark.parametrize("form", ["ncorr", "vic2d", "davis", "dice", "matchid", "gom", "pyvale"])
+@pytest.mark.parametrize(
+    "form", ["ncorr", "vic2d", "davis", "dice", "matchid", "gom", "aramis", "pyvale"]
+)
 def test_a_run_written_for_another_code_is_read_as_it_was(
     run: Path, tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -125,7 +127,7 @@ def test_lengths_in_pixels_stay_so(tmp_path: Path) -> None:
         read_field(*finished.export("vtu", tmp_path / "vtu", 4), grid)
 
 
-@pytest.mark.parametrize("form", ["gom", "matchid", "npz", "mat", "csv", "vic2d"])
+@pytest.mark.parametrize("form", ["gom", "aramis", "matchid", "npz", "mat", "csv", "vic2d"])
 def test_the_size_of_a_pixel_may_come_later(tmp_path: Path, form: str) -> None:
     grid = replace(GRID, pixel_size=1.0, x0=-60.0, y0=40.0)
     write_result(tmp_path / "a.h5", replace(result(affine(STRETCH)), grid=grid), Given("px"))

@@ -127,6 +127,13 @@ def test_grey_stored_as_colour_with_alpha_is_grey(tmp_path: Path) -> None:
     assert not any("Colour" in note for note in photograph.notes)
 
 
+def test_inks_are_turned_to_grey(tmp_path: Path) -> None:
+    """In a TIFF cyan, magenta and yellow were read as red, green and blue: a constant grey."""
+    grey = np.random.default_rng(0).integers(10, 240, (60, 60), dtype=np.uint8)
+    Image.fromarray(grey).convert("CMYK").save(tmp_path / "inks.tif")
+    np.testing.assert_allclose(read_photograph(tmp_path / "inks.tif").image, grey, atol=0.6)
+
+
 def test_white_stored_as_zero_is_inverted(tmp_path: Path) -> None:
     levels = counts(8)
     tifffile.imwrite(tmp_path / "a.tif", 255 - levels, photometric="miniswhite")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import brentq
+from scipy.spatial import KDTree
 from summary_schemas import faults
 
 from modeharvest.fem.field import Solution
@@ -29,7 +31,7 @@ from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.photograph.plain.matching import matched_contours
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain
-from modeharvest.idic.photograph.plain.surface import away_from_cuts, plain_surface
+from modeharvest.idic.photograph.plain.surface import away_from_cuts, coat_of_paint, plain_surface
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
@@ -582,3 +584,41 @@ def test_of_two_specimens_one_is_followed_and_the_other_one_named() -> None:
     np.testing.assert_array_equal(plain_surface(both, like=reference.mask).mask, reference.mask)
     cut = np.hstack([other[:, 30:], one])  # the other one is not all in view
     np.testing.assert_array_equal(plain_surface(cut).mask[:, -132:], reference.mask[:, -132:])
+
+
+def dots_of_paint(shift: tuple[float, float]) -> FloatImage:
+    """A light plate on black, with dark dots of 9 px at random; moved by (rows, cols) [px]."""
+    inner = np.random.default_rng(3).uniform(0.0, (200.0, 260.0), (130, 2))
+    row, col = (np.indices((600, 780)) + 0.5) / 3.0 - 0.5 - np.reshape(shift, (2, 1, 1))
+    dark = KDTree(inner).query(np.stack([row, col], axis=-1), workers=1)[0] < 4.5
+    plate = (abs(row - 99.5) < 79.0) & (abs(col - 129.5) < 109.0)
+    levels = np.where(plate, np.where(dark, 45.0, 205.0), 20.0).reshape(200, 3, 260, 3)
+    noise = np.random.default_rng(round(10 * shift[0])).normal(scale=2.0, size=(200, 260))
+    return np.asarray(np.rint(levels.mean(axis=(1, 3)) + noise), dtype=np.float32)
+
+
+def test_dots_of_paint_are_speckle_and_not_holes(tmp_path: Path) -> None:
+    """They were refused, as holes of which some weren't found in the deformed picture."""
+    images, shift = (dots_of_paint((0.0, 0.0)), dots_of_paint((1.3, -2.6))), (-2.6, -1.3)
+    for name, image in zip(("f", "g"), images, strict=True):
+        write_image(tmp_path / f"{name}.tif", np.clip(image, 0, 255).astype(np.uint8))
+    measure(tmp_path / "f.tif", [str(tmp_path / "g.tif")], tmp_path / "out")
+    found = read_result(tmp_path / "out/results/g.h5")
+    assert found.shown == "speckle"
+    off = np.linalg.norm(found.displacement - shift, axis=1)
+    assert np.median(off) < 0.03
+    assert np.sqrt(np.mean(off**2)) < 0.1
+
+
+def test_holes_of_a_lattice_are_not_dots_of_paint() -> None:
+    """Close to each other, also buckled: in turn upright and lying."""
+    image = np.full((290, 290), 0.7, dtype=np.float32)
+    row, col = np.indices(image.shape)
+    for k, place in enumerate(product(range(40, 260, 30), repeat=2)):
+        high = 12.0 if k % 2 else 7.0
+        near = ((row - place[0]) / high) ** 2 + ((col - place[1]) / (19.0 - high)) ** 2 < 1.0
+        image[near] = 0.1
+    image[[0, 1, -1, -2]] = image[:, [0, 1, -1, -2]] = 0.1
+    image = gaussian_filter(image, 0.6)
+    assert coat_of_paint(image) is None
+    assert plain_surface(image) is not None

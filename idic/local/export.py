@@ -26,9 +26,11 @@ _OFF_PX = 1e-3
 """Largest distance from whole pixels, for codes that know no other points."""
 Columns = dict[str, FloatArray]
 FORMATS = {"ncorr": ".mat", "vic2d": ".csv", "davis": ".txt", "dice": ".txt", "matchid": ".csv",
-           "gom": ".csv", "pyvale": ".csv", "csv": ".csv", "mat": ".mat", "npz": ".npz"
-           }  # fmt: skip
+           "gom": ".csv", "aramis": ".txt", "pyvale": ".csv", "csv": ".csv", "mat": ".mat",
+           "npz": ".npz"}  # fmt: skip
 """Suffix of each format, by the format's name in commands."""
+_OF_GOM = "gom", "aramis"
+"""Formats in mm, y up."""
 
 
 Tensors = Mapping[str, FloatArray]
@@ -51,11 +53,11 @@ def export_field(
     """
     if form not in FORMATS:
         raise InputError(f"expected a format among {', '.join(FORMATS)}, got {form!r}")
-    if unit == "px" and form == "gom":
-        raise InputError("expected the size of a pixel for gom, in mm; give --pixel-size")
+    if unit == "px" and form in _OF_GOM:
+        raise InputError(f"expected the size of a pixel for {form}, in mm; give --pixel-size")
     path = Path(path).with_suffix(FORMATS[form])
     texts, in_px = layouts()["written"], f"{form}_px"
-    is_down = form != "gom" and not (form in ("csv", "mat", "npz") and unit == "mm")
+    is_down = form not in _OF_GOM and not (form in ("csv", "mat", "npz") and unit == "mm")
     strains = _components(tensors or {}, field, is_down)
     numbers = _numbers(field, grid, strains)
     if form in texts:
@@ -101,15 +103,27 @@ def _numbers(field: LocalField, grid: PixelGrid, strains: Columns) -> Columns:
         "status": np.where(field.good, 4.0, 11.0), "v_up_mm": size * v,
     }  # fmt: skip
     both = ("col", "row", "u", "v")
-    own |= strains | {f"{name}_mm": size * own[name] for name in both}
+    own |= _technical(strains) | strains | {f"{name}_mm": size * own[name] for name in both}
     return own | {f"{name}0": np.nan_to_num(own[name]) for name in (*both, *strains)}
 
 
+def _technical(strains: Columns) -> Columns:
+    """Technical strains U - 1 of the right stretch tensor U, normal ones in %."""
+    if "logarithmic_xx" not in strains:
+        return {}
+    logarithmic = np.nan_to_num([[strains[f"logarithmic_{i}{j}"] for j in "xy"] for i in "xy"]).T
+    principal, axes = np.linalg.eigh(logarithmic)
+    stretch = np.einsum("nik,nk,njk->nij", axes, np.exp(principal), axes) - np.eye(2)
+    xx, yy, xy = (np.where(np.isnan(strains["F_xx"]), np.nan, stretch[:, i, j])
+                  for i, j in ((0, 0), (1, 1), (0, 1)))  # fmt: skip
+    return {"technical_xx": 100.0 * xx, "technical_yy": 100.0 * yy, "technical_xy": xy}
+
+
 def _write_text(path: Path, layout: Mapping[str, Any], numbers: Columns) -> None:
-    """Write a table: NaN is left empty; the decimal sign is a comma if semicolons separate."""
+    """Write a table: NaN is left empty; the decimal sign is a comma if it is the layout's."""
     separator, heads = layout["separator"], dict(layout["columns"])
     heads |= {head: of for head, of in layout.get("strains", {}).items() if of in numbers}
-    decimal = "," if separator == ";" else "."
+    decimal = layout.get("decimal", ".")
     with atomic(path) as part, part.open("w", encoding="utf-8") as file:
         file.write(separator.join(heads) + "\n")
         for row in np.column_stack([numbers[of] for of in heads.values()]):

@@ -60,16 +60,21 @@ def window_for(cell_px: float) -> int:
     return int(np.clip(_WINDOW_SHARE * cell_px, 9, _WIDEST_PX)) // 2 * 2 + 1
 
 
-def find_material(image: ArrayLike, window: int = _WIDEST_PX) -> MaterialMask:
+def find_material(
+    image: ArrayLike, window: int = _WIDEST_PX, coat: BoolArray | None = None
+) -> MaterialMask:
     """Find the material in an image (rows, cols) of a speckled specimen, grey levels in any unit.
 
     ``window`` is the size of the square in which the speckle's contrast is evaluated [px]: two to
-    three speckles across, and well below a hole's diameter. Raises InputError unless the image is
-    plane, finite, larger than the window, and shows a speckle.
+    three speckles across, and well below a hole's diameter. ``coat``: True on the coat of paint
+    around dots, which is material, however dull. Raises InputError unless the image is plane,
+    finite, larger than the window, and shows a speckle.
     """
     grey = _checked(image, window)
     contrast = _local_contrast(grey, window)
     sure, ratio = _surely_background(contrast, window)
+    if coat is not None:
+        sure &= ~coat
     if not sure.any():
         if not contrast.max() > 0.0:
             raise InputError("expected a speckled material in the image, got a constant grey level")
@@ -87,6 +92,8 @@ def find_material(image: ArrayLike, window: int = _WIDEST_PX) -> MaterialMask:
             "background's grey levels are everywhere; give the mask as an image"
         )
     material, walls = _without_walls(grey, material, window)
+    if coat is not None:
+        material = material | coat
     return MaterialMask(material, _text(material, ratio, alike, walls))
 
 

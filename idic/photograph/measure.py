@@ -17,13 +17,19 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz, for_cells
 from modeharvest.idic.chebyshev import Brightness
-from modeharvest.idic.correlate import ASTRAY, correlate
+from modeharvest.idic.correlate import ASTRAY, correlate, refitted_result
 from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField, refitted, refitted_correlation
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion
-from modeharvest.idic.photograph.displacement import block_motion, displacement_from, misfit_of
+from modeharvest.idic.photograph.displacement import (
+    LOCAL,
+    block_motion,
+    displacement_from,
+    light_for,
+    misfit_of,
+)
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
@@ -62,6 +68,11 @@ _REFITTED = (
     "From the best start there is the correlation ended in a local minimum: the result is the "
     "ansatz refitted to the whole displacement, with the standard deviations by noise that a "
     "correlation would have."
+)
+_LOCAL_LIGHT = (
+    "The light changed along the material otherwise than by polynomials, which a correlation takes "
+    "for displacement: the result is the ansatz refitted to the whole displacement, for which gain "
+    "and offset were taken from around each pixel; light the specimen evenly."
 )
 _LOWER = "There are few cells: v0 is of degree {} and v1 of degree {}."
 
@@ -166,9 +177,10 @@ def measure_whole(
     """Measure the whole displacement of a photograph that was correlated, and the modes in it.
 
     The measurement starts from the correlation, or from blocks of the speckle if that failed. The
-    ansatz fitted to the measurement starts another correlation if the spectra show other waves than
-    the first one has, or a family with fewer parameters for them, or if that one isn't converged;
-    if the second fails, too, the fit itself is the result. For the rest see :func:`measure`.
+    ansatz fitted to the measurement is the result if the light changed otherwise than by
+    polynomials; else it starts another correlation if the spectra show other waves than the first
+    one has, or a family with fewer parameters for them, or if that one isn't converged; if the
+    second fails, too, the fit itself is the result. For the rest see :func:`measure`.
     """
     mesh, found, mask = body.mesh, first.result, geometry.mask
     if found.outcome not in ASTRAY:
@@ -190,7 +202,12 @@ def measure_whole(
         pair, geometry, cell_size, how, measured.at_points(cell_size / POINTS_A_CELL)
     )
     now, before = (sum(mode.family.size for mode in one.modes) for one in (ansatz, found.ansatz))
-    if now >= before and _goes_on(found, ansatz, unknowns):
+    if light_for(normalised, measured.displacement_on(), light) == LOCAL:
+        refit = refitted(measured, ansatz, unknowns, mask)
+        a = np.append(refit.unknowns, unknowns[refit.unknowns.size :])
+        found = refitted_result(pair, ansatz, a, how.options())
+        text, warnings = (first.text[0], *reading), (*warnings, _LOCAL_LIGHT)
+    elif now >= before and _goes_on(found, ansatz, unknowns):
         refit = refitted(measured, found.ansatz, found.unknowns, mask)
         text = (*first.text, "The spectra of the whole displacement show no other waves.")
     else:

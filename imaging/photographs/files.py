@@ -123,6 +123,8 @@ def _read_tiff(path: Path, single: bool) -> StoredImage:
         if single and len(file.series[0].pages) > 1:
             raise _not_plane(file.series[0].shape, path)
         require_plausible(path, page.nbytes)
+        if page.photometric == tifffile.PHOTOMETRIC.SEPARATED:  # inks, CMYK
+            return _by_pillow(path, page, notes)
         try:
             levels = np.asarray(page.asarray())
         except (ValueError, ImportError) as error:
@@ -153,8 +155,8 @@ def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> StoredI
         codec = tifffile.COMPRESSION(page.compression).name
         raise InputError(
             f"expected a TIFF that can be read unchanged at {path}, got {page.bitspersample}-bit "
-            f"colour with {codec} compression; save it without compression, or "
-            "install imagecodecs"
+            f"colour with {codec} compression; save it as grey or RGB without compression, "
+            "or install imagecodecs"
         )
     with Image.open(path) as picture:
         return _from_pillow(picture, notes)

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import binary_fill_holes, gaussian_filter, label
+from scipy.ndimage import binary_fill_holes, center_of_mass, gaussian_filter, label
 from scipy.signal import savgol_filter
+from scipy.spatial import cKDTree
 from skimage.filters import threshold_otsu
 
 from modeharvest.idic.finite_element.mesh import find_contours
@@ -52,6 +53,11 @@ _LEAST_PX2 = 60.0
 """Area of a hole or island; smaller ones are dirt."""
 _DOT = 1.0 / 6.0
 """Largest area of a dot on the material, over that of the largest hole."""
+_PAINTED, _PAINTED_PX, _PAINTED_PX2 = 10, 45.0, 12
+"""Least number of dots of paint, their largest distance from each other [px], and least area."""
+_IRREGULAR, _MANY = 0.12, 3
+"""Coefficient of variation of the distances between neighbours from which on patches are not holes
+of a lattice (0.05 of buckled ones, 0.2 of dots at random), and number of dots for each hole."""
 _CLEAR = 0.02
 """Share of the picture's border that may be dirt."""
 _ONE_OF_MANY = 0.2
@@ -105,27 +111,48 @@ class MaterialContours:
         return closed[:outer], closed[outer:], cut, dots
 
 
+def coat_of_paint(image: FloatImage) -> BoolArray | None:
+    """(rows, cols) True on the coat of paint around dots of another grey level; None without dots.
+
+    Unlike holes, dots are many, close to each other, and irregular in their places. They give more
+    information by their grey levels than by their contours, as speckle does.
+    """
+    found = _material(np.asarray(image, dtype=np.float32))
+    return found[0] if found and _has_dots_of_paint(found[0]) else None
+
+
+def _has_dots_of_paint(material: BoolArray) -> bool:
+    """Whether the patches that a material surrounds are dots of paint instead of holes."""
+    whole = binary_fill_holes(material)
+    parts, count = label(large_parts(whole & ~material, _PAINTED_PX2))
+    if count < _PAINTED or whole.sum() > count * _PAINTED_PX**2:
+        return False
+    areas = np.bincount(parts.ravel())[1:]
+    large = np.flatnonzero(areas >= _DOT * areas.max()) + 1
+    if count > (1 + _MANY) * len(large):
+        return True
+    centres = np.array(center_of_mass(parts > 0, parts, large))
+    near = cKDTree(centres).query(centres, k=2)[0][:, 1]
+    return bool(len(large) >= _PAINTED and near.std() > _IRREGULAR * near.mean())
+
+
 def plain_surface(
     image: FloatImage, like: BoolArray | None = None, dot_px2: float | None = None
 ) -> MaterialContours | None:
     """Find the contours of a plain material in a picture (rows, cols); None if it has speckle.
 
-    Of several specimens the largest is taken, or the one where ``like`` is True. One that reaches
+    Of several specimens the largest is taken, or the one where ``like`` is True (its reference,
+    which decides whether patches are holes or dots of paint). One that reaches
     the picture's border is in view in part: its contours end there. Contours within the material of
     an area [px^2] below ``dot_px2``, by default a sixth of the largest hole's, are dots on it.
     """
     image = np.asarray(image, dtype=np.float32)
     if ((image == image.min()) | (image == image.max())).all():  # thresholded: soften the steps
         image = gaussian_filter(image, _LENS_PX)
-    grey = gaussian_filter(image, _BLUR_PX)
-    few = max(1, min(grey.shape) // _COARSE_PX)
-    found = None if _two_levels(grey[::few, ::few]) is None else _two_levels(grey)
-    if found is None:
+    found = _material(image)
+    if found is None or (like is None and _has_dots_of_paint(found[0])):
         return None
-    bright, middle, step = found
-    material = large_parts(bright if _is_material(bright) else ~bright, _LEAST_PX2)
-    if not material.any() or _shows_speckle(image, material, step):
-        return None
+    material, grey, middle, step = found
     material = material | ~large_parts(~material, _LEAST_PX2)
     material, text = one_specimen(material, like, "crop the pictures to measure another one")
     contours, cut = contours_around(grey - middle, material)
@@ -148,6 +175,23 @@ def plain_surface(
     # Noise and grey level were taken without the dots, which are material all the same.
     mask = _filled(material, most) if dots else material
     return MaterialContours(mask, sharp, noise / slope**2, text, ends, marks)
+
+
+def _material(image: FloatImage) -> tuple[BoolArray, FloatImage, FloatArray, FloatArray] | None:
+    """Material of one level, the blurred picture, the middle of its levels, their difference.
+
+    All are (rows, cols). None if the picture has more than two grey levels, or speckle.
+    """
+    grey = gaussian_filter(image, _BLUR_PX)
+    few = max(1, min(grey.shape) // _COARSE_PX)
+    found = None if _two_levels(grey[::few, ::few]) is None else _two_levels(grey)
+    if found is None:
+        return None
+    bright, middle, step = found
+    material = large_parts(bright if _is_material(bright) else ~bright, _LEAST_PX2)
+    if not material.any() or _shows_speckle(image, material, step):
+        return None
+    return material, grey, middle, step
 
 
 def _without_dots(

@@ -12,7 +12,9 @@ from modeharvest.cli.messages import bars, folder_option
 from modeharvest.util.errors import InputError
 
 Run = Annotated[Path, typer.Argument(metavar="DIR", help="A run's folder, or a file of it.")]
-_FORMATS = "ncorr, vic2d, davis, dice, matchid, gom, pyvale, csv, mat, npz; runs: hdf5, vtu, tiff"
+_FORMATS = (
+    "ncorr, vic2d, davis, dice, matchid, gom, aramis, pyvale, csv, mat, npz; runs: hdf5, vtu, tiff"
+)
 
 
 def export(

@@ -59,7 +59,7 @@ from modeharvest.idic.photograph.gauges import (
 )
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain, write_shapes
-from modeharvest.idic.photograph.plain.surface import MaterialContours, plain_surface
+from modeharvest.idic.photograph.plain.surface import MaterialContours, coat_of_paint, plain_surface
 from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
@@ -220,7 +220,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         if self.plain is not None:
             mask, blank = self.plain.mask, self.plain.warnings
         else:
-            mask, blank = speckled(image, find_material(image).mask if given is None else given)
+            if given is None:
+                given = find_material(image, coat=coat_of_paint(image)).mask
+            mask, blank = speckled(image, given)
         found = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
         return found._replace(changes=(*blank, *found.changes))
 

@@ -59,6 +59,7 @@ from modeharvest.idic.photograph.speckled_edges import (
     measure_by_contours,
 )
 from modeharvest.idic.result import Covariance, Result
+from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum
@@ -102,7 +103,7 @@ _BOTH = "", "_speckle"
 _MUCH = 0.01
 _UNEVEN = (
     "The light changed along the material, by {:.0f} %, which is taken for displacement: harvest "
-    "with brightness = {} or {} in [correlation], and light the specimen evenly."
+    "with brightness = {} or {} in [correlation], or with --whole-field; light the specimen evenly."
 )
 _LEFT = (
     "{:.0f} % of the material has left the image: there v0 and v1 are extrapolated, with larger "
@@ -417,7 +418,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             own["w"] = measured_spectrum(w, cell, box)
         out = result.outside_image / max(1, result.pixels + result.outside_image)
         left = (_LEFT.format(100 * out),) * (out > _MUCH)
-        if self._plain is None and out < 0.5:
+        if self._plain is None and out < 0.5 and result.outcome is not Outcome.REFITTED:
             degree = Brightness.of(case.correlation.brightness).degree or 0
             change = uneven_light(pair, result.displacement(), degree)
             left += (_UNEVEN.format(100 * change, degree + 1, degree + 2),) * (change > UNEVEN)

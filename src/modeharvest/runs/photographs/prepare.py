@@ -20,7 +20,7 @@ from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.idic.photograph.matching.holes import RigidMotion, rigid_motion
 from modeharvest.idic.photograph.material import find_material, window_for
-from modeharvest.idic.photograph.plain.surface import one_specimen, plain_surface
+from modeharvest.idic.photograph.plain.surface import coat_of_paint, one_specimen, plain_surface
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial, calibrate
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
@@ -324,11 +324,12 @@ def _material(
         mask = read_mask(given)
         require_same_shape(photograph.image, mask, str(photograph.path), str(given))
         return ShownMaterial(mask)
+    coat = None if like and like.is_plain else coat_of_paint(photograph.image)
     where = like.mask if like else None
-    plain = plain_surface(photograph.image, where)
+    plain = None if coat is not None else plain_surface(photograph.image, where)
     if plain is not None:
         return ShownMaterial(plain.mask, (_PLAIN,), True, plain.warnings)
-    found = find_material(photograph.image, window)
+    found = find_material(photograph.image, window, coat)
     return ShownMaterial(found.mask, found.text)
 
 

@@ -29,6 +29,7 @@ from modeharvest.idic.modes import ModeFamily, turning_family
 from modeharvest.idic.photograph.geometry import find_geometry, junction
 from modeharvest.idic.photograph.matching.holes import matched_holes
 from modeharvest.idic.photograph.material import find_material, window_for
+from modeharvest.idic.photograph.plain.surface import coat_of_paint
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
@@ -162,7 +163,7 @@ class QuickMeasurement:
         self.thumbnail: FloatImage | None = None
 
     def _material(self, image: FloatImage) -> BoolArray:
-        return find_material(image, window_for(self._cell_px)).mask
+        return find_material(image, window_for(self._cell_px), coat_of_paint(image)).mask
 
     @property
     def _cell_px(self) -> float:
