@@ -19,17 +19,12 @@ from modeharvest.idic.ansatz import Ansatz, for_cells
 from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.correlate import ASTRAY, correlate, refitted_result
 from modeharvest.idic.finite_element.equations.system import Body
+from modeharvest.idic.finite_element.light import LOCAL, light_for
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField, refitted, refitted_correlation
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion
-from modeharvest.idic.photograph.displacement import (
-    LOCAL,
-    block_motion,
-    displacement_from,
-    light_for,
-    misfit_of,
-)
+from modeharvest.idic.photograph.displacement import block_motion, displacement_from, misfit_of
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
