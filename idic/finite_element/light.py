@@ -40,8 +40,9 @@ _BY_CHANCE = 0.2
 """That range by noise alone, at most, over the noise's share of the mean level."""
 _MARGIN_PX = 4.0
 """Pixels closer to an edge don't count: a displacement that is off shows background there [px]."""
-_SAMPLES, _LEAST = 100_000, 0.1
-"""Pixels from which brightness is fitted; least gain anywhere, over the mean."""
+_SAMPLES, _IN_A_WINDOW, _LEAST = 100_000, 2000, 0.1
+"""Pixels from which brightness is fitted, at least, and in a window, if it has so many: speckle and
+noise of fewer would be taken for light; least gain anywhere, over the mean."""
 _UNLIKE, _ROUNDS = 4.5, 4
 """Residual over its median, 3 standard deviations of noise, beyond which pixels don't match; how
 often gain and offset are found without these."""
@@ -68,7 +69,8 @@ class _Samples(NamedTuple):
         """Choose pixels off the edges; u (rows, cols, 2) [mm], NaN where it isn't known."""
         inner = shrunk(pair.masks[0], _MARGIN_PX)
         where = (inner if inner.any() else pair.masks[0]) & np.isfinite(u).all(axis=-1)
-        every = max(1, int(where.sum() / _SAMPLES))
+        window = 4.0 * np.pi * (_WINDOW * speckle_size(pair.reference, pair.masks[0])) ** 2
+        every = max(1, int(min(where.sum() / _SAMPLES, window / _IN_A_WINDOW)))
         row, col = (places[::every] for places in np.nonzero(where))
         found = cls(row, col, pair.reference[row, col].astype(float), _moved(pair, u, row, col))
         if not found.known.any() or not np.ptp(found.g[found.known]) > 0.0:
@@ -79,11 +81,6 @@ class _Samples(NamedTuple):
     def known(self) -> BoolArray:
         """(p,) True inside the deformed image."""
         return np.asarray(np.isfinite(self.g))
-
-    def misfit(self, maps: Maps) -> float:
-        """Root mean square of the residual [grey levels]."""
-        gain, offset = (part[self.row, self.col] for part in maps)
-        return float(np.sqrt(np.nanmean((self.f - gain * self.g - offset) ** 2)))
 
     def maps(self, pair: ImagePair, light: int | Literal["local"]) -> Maps:
         """Gain and offset of a light, over the pair's pixels."""
@@ -172,7 +169,7 @@ def residual(pair: ImagePair, u: FloatArray, light: Light = 0) -> FloatArray:
 
 
 def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> Light:
-    """The degree; LOCAL if the light changed otherwise, and the images match better with it.
+    """The degree; LOCAL if the light changed otherwise.
 
     ``u`` (rows, cols, 2) [mm], NaN where it isn't known; near the truth elsewhere.
     """
@@ -182,9 +179,8 @@ def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> Light:
     noise = np.linalg.norm([estimated_noise(image, mask).sd for image, mask in images])
     chance = _BY_CHANCE * float(noise) / abs(float(pair.reference[pair.masks[0]].mean()))
     at = _Samples.of(pair, u)
-    maps = at.maps(pair, degree), at.maps(pair, LOCAL)
-    is_uneven = _range_between(*maps, pair, u) > max(UNEVEN, chance)
-    return LOCAL if is_uneven and at.misfit(maps[1]) < at.misfit(maps[0]) else degree
+    change = _range_between(at.maps(pair, degree), at.maps(pair, LOCAL), pair, u)
+    return LOCAL if change > max(UNEVEN, chance) else degree
 
 
 def uneven_light(pair: ImagePair, u: FloatArray, degree: int) -> float:
