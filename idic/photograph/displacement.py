@@ -186,6 +186,10 @@ def displacement_from(
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
     images = first.images(coarse.u, _AT_EDGE_PX, light)
     found = measured(images, coarse.start)
+    u = on_pixels(pair.grid, body.mesh, found.displacement)
+    if light != LOCAL and light_for(pair, u, light_degree) == LOCAL:  # the first one followed it
+        images = first.images(found.displacement, _AT_EDGE_PX, LOCAL)
+        found = measured(images, coarse.start)
     wave = (found.cutoff_px or 0.0) * pair.grid.pixel_size
     if wave < _SMOOTHER_FROM * first.wave:
         return found
