@@ -481,7 +481,7 @@ def test_light_is_not_estimated_from_a_start_that_is_off(monkeypatch: pytest.Mon
         4.0 * GRID.pixel_size * np.stack([np.sin(2 * np.pi * y / 1.2), np.cos(2 * np.pi * x / 1.2)])
     )
     result = displacement_from(quadratic_field(body.mesh.nodes) + off.T, pair, body, light_degree=1)
-    assert found == [1]
+    assert set(found) == {1}
     assert pair.truth is not None
     error = (result.displacement_on() - pair.truth.displacement)[pair.masks[0]] / GRID.pixel_size
     assert np.abs(error).max() < 0.3

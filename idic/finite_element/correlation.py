@@ -24,7 +24,7 @@ from modeharvest.idic.finite_element.equations.system import Body, Imbalance, Li
 from modeharvest.idic.finite_element.fields import determinant, element_gradients
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.free_edges import FreeEdges
-from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
 from modeharvest.idic.solver.sampling import well_sampled
 from modeharvest.idic.solver.weighting import best_blur
@@ -121,8 +121,8 @@ class MeshCorrelation:
         self.u: FloatArray = start.ravel().copy()
         """(2 n,) displacements of the nodes [mm]."""
         self.edges: FreeEdges | None = None
-        images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
-        self.noise = tuple(estimated_noise(image, mask).sd ** 2 for image, mask in images)
+        noise = ImageNoise.estimated(pair)
+        self.noise = noise.reference**2, noise.deformed**2
         """Variances of the noise of f and g [grey levels^2]."""
         self.noise_power = 1.0
         """Power of the noise at long waves, over its variance."""

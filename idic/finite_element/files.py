@@ -30,7 +30,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
 from modeharvest.util.typed import made, to_plain
 
-FORMAT = "modeharvest-nodal-displacement-6"
+FORMAT = "modeharvest-nodal-displacement-7"
 _TYPES = get_type_hints(NodalResult)
 _ARRAYS = [name for name, kind in _TYPES.items() if kind == FloatArray]
 _PLAIN = [name for name in _TYPES if name not in (*_ARRAYS, "mesh", "roots")]

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.chebyshev import Box, ChebyshevField
 from modeharvest.idic.solver.final_smoothing import speckle_size
-from modeharvest.idic.solver.noise import estimated_noise
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
@@ -50,6 +50,10 @@ _WINDOW = 3.0
 """Standard deviation of the Gaussian window, over the speckle size."""
 _BINS = 4.0
 """Bins in a window's standard deviation."""
+_ORDER = 5
+"""Order of the spline through the deformed image."""
+_NOISE = 0.5
+"""Largest share of an image's variance that is taken for noise: fine speckle looks like it."""
 _FAR = 2e-3
 """Weight of the whole material in each window, over that of a window full of material: it alone
 counts far from the material."""
@@ -63,6 +67,8 @@ class _Samples(NamedTuple):
     f: FloatArray
     g: FloatArray
     """(p,) g(x + u) [grey levels]; NaN outside the image."""
+    noise: tuple[float, float]
+    """Variances of noise in f and in g(x + u) [grey levels squared]."""
 
     @classmethod
     def of(cls, pair: ImagePair, u: FloatArray) -> _Samples:
@@ -72,7 +78,10 @@ class _Samples(NamedTuple):
         window = 4.0 * np.pi * (_WINDOW * speckle_size(pair.reference, pair.masks[0])) ** 2
         every = max(1, int(min(where.sum() / _SAMPLES, window / _IN_A_WINDOW)))
         row, col = (places[::every] for places in np.nonzero(where))
-        found = cls(row, col, pair.reference[row, col].astype(float), _moved(pair, u, row, col))
+        f, g = pair.reference[row, col].astype(float), _moved(pair, u, row, col)
+        noise, u_px = ImageNoise.estimated(pair), np.asarray(u[row, col] / pair.grid.pixel_size)
+        in_g = noise.deformed**2 * NoiseTransfer.at(u_px, np.ones(len(u_px)), _ORDER).value
+        found = cls(row, col, f, g, (noise.reference**2, in_g))
         if not found.known.any() or not np.ptp(found.g[found.known]) > 0.0:
             raise InputError("expected pixels of the material in both images, got none in common")
         return found
@@ -111,7 +120,8 @@ class _Samples(NamedTuple):
     def _around_each(self, shape: tuple[int, int], width: float) -> Maps:
         """Those of windows of a standard deviation [px]: ratio of contrasts, difference of means.
 
-        Windows average the light: gain and offset are found again in what is left, some times.
+        Noise is no contrast: more of it in one image would be light where speckle is faint. Windows
+        average the light: gain and offset are found again in what is left, some times.
         """
         bin_px = max(1, int(width / _BINS))
         bins = tuple(-(-size // bin_px) for size in shape)
@@ -130,9 +140,11 @@ class _Samples(NamedTuple):
             far = _FAR * bin_px**2 * powers.mean(axis=1)
             around = gaussian_filter(sums.reshape(-1, *bins), (0.0, width / bin_px, width / bin_px),
                                      mode="constant") + far[:, None, None]  # fmt: skip
-            mean_f, mean_g, square_f, square_g = around[1:] / around[0]
-            more = np.sqrt((square_f - mean_f**2) / (square_g - mean_g**2))
-            gain, offset = more * gain, more * (offset - mean_g) + mean_f
+            mean, square = np.split(around[1:] / around[0], 2)
+            both, noise = square - mean**2, [self.noise[0] * np.ones(bins), self.noise[1] * gain**2]
+            speckle = np.maximum(both - noise, (1.0 - _NOISE) * both)
+            more = np.sqrt(speckle[0] / speckle[1])
+            gain, offset = more * gain, more * (offset - mean[1]) + mean[0]
             lit = on(gain, self.row, self.col) * g + on(offset, self.row, self.col)
             left = np.abs(f - lit)
             there = left <= _UNLIKE * np.nanmedian(left)
@@ -175,10 +187,8 @@ def light_for(pair: ImagePair, u: FloatArray, degree: int | None) -> Light:
     """
     if degree is None or not np.isfinite(u).any():
         return degree
-    images = zip((pair.reference, pair.deformed), pair.masks, strict=True)
-    noise = np.linalg.norm([estimated_noise(image, mask).sd for image, mask in images])
-    chance = _BY_CHANCE * float(noise) / abs(float(pair.reference[pair.masks[0]].mean()))
     at = _Samples.of(pair, u)
+    chance = _BY_CHANCE * float(np.sqrt(sum(at.noise)) / abs(pair.reference[pair.masks[0]].mean()))
     change = _range_between(at.maps(pair, degree), at.maps(pair, LOCAL), pair, u)
     return LOCAL if change > max(UNEVEN, chance) else degree
 
@@ -210,5 +220,5 @@ def _range_between(coarse: Maps, fine: Maps, pair: ImagePair, u: FloatArray) -> 
 def _moved(pair: ImagePair, u: FloatArray, row: NDArray[Any], col: NDArray[Any]) -> FloatArray:
     """(p,) g(x + u) of some pixels [grey levels]; NaN outside the deformed image."""
     moved = u[row, col] / pair.grid.pixel_size
-    g, _, _ = SplineImage.of(pair.deformed, 5).sample(row - moved[:, 1], col + moved[:, 0])
+    g, _, _ = SplineImage.of(pair.deformed, _ORDER).sample(row - moved[:, 1], col + moved[:, 0])
     return g

@@ -16,6 +16,7 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import ASTRAY, correlate, fit_displacement, refitted_result
 from modeharvest.idic.finite_element.cutoff import Risk
 from modeharvest.idic.finite_element.fields import deviation_of, field_of, nodal_gradient
+from modeharvest.idic.finite_element.light import Light
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
@@ -76,6 +77,8 @@ class NodalResult:
     surface that has changed, or out of the picture."""
     noise_power: float = 1.0
     """Power of the images' noise at long waves, over its variance [-]: 1 for white noise."""
+    light: Light = None
+    """Variation of gain and offset by which the images were made equally bright."""
     shown: str = "speckle"  # or "contours", for which residuals are distances [px]
     roots: FloatArray | None = None
     """(n, 2, k) vectors whose outer products sum up to the covariance of all nodal displacements

@@ -188,8 +188,9 @@ def displacement_from(
     found = measured(images, coarse.start)
     u = on_pixels(pair.grid, body.mesh, found.displacement)
     if light != LOCAL and light_for(pair, u, light_degree) == LOCAL:  # the first one followed it
-        images = first.images(found.displacement, _AT_EDGE_PX, LOCAL)
+        light, images = LOCAL, first.images(found.displacement, _AT_EDGE_PX, LOCAL)
         found = measured(images, coarse.start)
+    found = replace(found, light=light)
     wave = (found.cutoff_px or 0.0) * pair.grid.pixel_size
     if wave < _SMOOTHER_FROM * first.wave:
         return found
@@ -198,7 +199,7 @@ def displacement_from(
         smoother = measured(images, body.smoothed(coarse.start, over * wave))
         if (smoother.cutoff_px or 0.0) * pair.grid.pixel_size >= wave:
             break
-    return smoother
+    return replace(smoother, light=light)
 
 
 def shortest_wave(pair: ImagePair) -> float:

@@ -19,7 +19,7 @@ from modeharvest.idic.ansatz import Ansatz, for_cells
 from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.correlate import ASTRAY, correlate, refitted_result
 from modeharvest.idic.finite_element.equations.system import Body
-from modeharvest.idic.finite_element.light import LOCAL, light_for
+from modeharvest.idic.finite_element.light import LOCAL
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import WholeField, refitted, refitted_correlation
 from modeharvest.idic.local.field import LocalField
@@ -42,13 +42,7 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.idic.solver.gauss_newton import Outcome
-from modeharvest.idic.solver.noise import (
-    GIVEN,
-    CameraNoise,
-    ImageNoise,
-    estimated_noise,
-    spline_autocorrelation,
-)
+from modeharvest.idic.solver.noise import GIVEN, CameraNoise, ImageNoise, spline_autocorrelation
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.solver.residual_test import ResidualTest, autocorrelation, lags_for
 from modeharvest.idic.uncertainty.identifiability import identifiability
@@ -81,11 +75,8 @@ def image_noise(pair: ImagePair, camera: CameraNoise) -> ImageNoise:
     sd = camera.sd
     if camera.source == GIVEN:
         return ImageNoise(sd, sd)
-    in_f, in_g = (
-        estimated_noise(image, mask).sd
-        for image, mask in zip((pair.reference, pair.deformed), pair.masks, strict=True)
-    )
-    return ImageNoise(sd, sd * in_g / in_f if in_f > 0.0 else sd)
+    seen = ImageNoise.estimated(pair)
+    return ImageNoise(sd, sd * seen.deformed / seen.reference if seen.reference > 0.0 else sd)
 
 
 def residual_test(result: Result, pair: ImagePair, noise: ImageNoise, edge_px: int) -> ResidualTest:
@@ -197,7 +188,7 @@ def measure_whole(
         pair, geometry, cell_size, how, measured.at_points(cell_size / POINTS_A_CELL)
     )
     now, before = (sum(mode.family.size for mode in one.modes) for one in (ansatz, found.ansatz))
-    if light_for(normalised, measured.displacement_on(), light) == LOCAL:
+    if measured.light == LOCAL:
         refit = refitted(measured, ansatz, unknowns, mask)
         a = np.append(refit.unknowns, unknowns[refit.unknowns.size :])
         found = refitted_result(pair, ansatz, a, how.options())

@@ -20,6 +20,7 @@ from scipy import ndimage, special
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -161,6 +162,12 @@ class ImageNoise:
     def of(cls, value: ImageNoise | float) -> ImageNoise:
         """The noise itself, or that of two images with the same."""
         return value if isinstance(value, ImageNoise) else cls(float(value), float(value))
+
+    @classmethod
+    def estimated(cls, pair: ImagePair) -> ImageNoise:
+        """The noise that the finest details of the material show in each image."""
+        f, g = zip((pair.reference, pair.deformed), pair.masks, strict=True)
+        return cls(estimated_noise(*f).sd, estimated_noise(*g).sd)
 
 
 @dataclass(frozen=True)

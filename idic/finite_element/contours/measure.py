@@ -119,6 +119,7 @@ def displacement_from_contours(
         outside=int((state.edge.length == 0.0).sum()),
         effective_unknowns=known,
         library="" if state.last_factor is None else state.last_factor.library,
+        light=0,  # contours are edges in each image by itself
         shown="contours",
         warnings=stepped if converged else (UNSETTLED, *stepped),
     )

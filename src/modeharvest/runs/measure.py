@@ -38,7 +38,7 @@ from modeharvest.idic.finite_element.files import (
     write_result,
     write_vtu,
 )
-from modeharvest.idic.finite_element.light import LOCAL, brightness, light_for, residual
+from modeharvest.idic.finite_element.light import LOCAL, brightness, residual
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import MeshedMaterial, mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
@@ -60,7 +60,7 @@ from modeharvest.idic.photograph.gauges import (
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain, write_shapes
 from modeharvest.idic.photograph.plain.surface import MaterialContours, coat_of_paint, plain_surface
-from modeharvest.idic.solver.noise import estimated_noise
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
@@ -142,11 +142,6 @@ class MeasureCase:
         """The files of the deformed images, by image name, in the order of the test."""
         paths = self.sequence.deformed if self.sequence else named_files(Path(), self.deformed)
         return {path.stem: path for path in paths}
-
-    @property
-    def light_degree(self) -> int | None:
-        """Degree of gain and offset; None for images of one brightness."""
-        return Brightness.of(self.brightness).degree
 
     @property
     def unit(self) -> str:
@@ -322,8 +317,9 @@ class MeasureRun(StagedRun[MeasureCase]):
             return found, *write_shapes(folder, name, contours, self.case.unit)
         names = str(self.case.reference), str(self.case.files[name])
         known = 0.0 * body.mesh.nodes if before is None else before.displacement
-        start, light = block_motion(pair, body, known, names), self.case.light_degree
-        return (displacement_from(start, pair, body, light_degree=light, progress=self.progress),)
+        start, light = block_motion(pair, body, known, names), Brightness.of(self.case.brightness)
+        return (displacement_from(start, pair, body, light_degree=light.degree,
+                                  progress=self.progress),)  # fmt: skip
 
     def _with_roots(self) -> Iterator[tuple[str, NodalResult]]:
         """Name and displacement of each image, with the square roots of its covariance."""
@@ -332,8 +328,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN outside the material."""
-        pair, u = self.pair(name), result.displacement_on()
-        return residual(pair, u, light_for(pair, u, self.case.light_degree))
+        return residual(self.pair(name), result.displacement_on(), result.light)
 
     def picture(self, name: str) -> FloatImage:
         """(rows, cols) one deformed image, scaled from 0 (black) to 1 (white)."""
@@ -414,12 +409,10 @@ class MeasureRun(StagedRun[MeasureCase]):
             return numbers
         pair = self.pair(name)
         f, material = pair.reference, pair.masks[0]
-        light = light_for(pair, u, self.case.light_degree)
-        maps = brightness(pair, u, light)
-        gain, offset = (part[material].mean() for part in maps)
+        gain, offset = (part[material].mean() for part in brightness(pair, u, result.light))
         moved = deformed_mask(self.grid, result.mesh, result.displacement, 0.0)
-        noise_g = estimated_noise(pair.deformed, material if moved is None else moved).sd
-        noise = float(np.hypot(estimated_noise(f, material).sd, gain * noise_g))
+        seen = ImageNoise.estimated(replace(pair, deformed_mask=moved))
+        noise = float(np.hypot(seen.reference, gain * seen.deformed))
         return numbers | {
             "cutoff_px": result.cutoff_px,
             "outside_px": result.outside,
@@ -429,7 +422,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "warnings": [
                 *result.warnings,
                 *misfit_of(result, noise, f[material]),
-                *(_LOCAL_LIGHT,) * (light == LOCAL),
+                *(_LOCAL_LIGHT,) * (result.light == LOCAL),
             ],
         }
 
