@@ -44,6 +44,8 @@ from modeharvest.validation.scoring.star import Star, exact_images, fine_speckle
 from modeharvest.validation.truth import rms
 
 BLUR = "modeharvest.idic.finite_element.correlation.well_sampled"
+LENS = {"fill_factor": 1.0, "psf_px": 0.7}
+"""Sensor that shows means over its pixels' area, behind a lens with that point spread."""
 Images = tuple[list[np.ndarray], np.ndarray, np.ndarray]
 """Reference and deformed images [0 ... 1], mask, u of the last one (rows, cols, 2), y up [px]."""
 
@@ -66,8 +68,7 @@ def specimen(
         spec.speckle, standard_deviation=spec.speckle.standard_deviation / size,
         blur_px=max(0.8, spec.speckle.blur_px * size),
     )  # fmt: skip
-    noise = imaging.pop("noise", None)
-    sensor = spec.sensor if noise is None else replace(spec.sensor, read_noise=noise)
+    sensor = replace(spec.sensor, **imaging.pop("sensor", {}))
     imaging = {"pixel_size": 0.02, "distortion": None, "shape": None} | imaging
     spec = replace(spec, speckle=speckle, sensor=sensor, background=0.06, **imaging)
     return imaged(Solution.read(solution), spec, folder, strain, light)
@@ -132,6 +133,11 @@ Camera = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 def white(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
     """A camera with white noise."""
     return np.asarray(image + noise * random.standard_normal(image.shape))
+
+
+def blurring(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
+    """A lens with a point spread of 0.7 px, and white noise."""
+    return white(gaussian_filter(image, LENS["psf_px"]), noise, random)
 
 
 def smoothing(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
@@ -218,7 +224,15 @@ CASES: dict[str, Callable[[Path], Images]] = {
     "paper's specimen, 12.8 %": specimen,
     "7.8 %, before buckling": lambda folder: specimen(folder, strain=0.078),
     "12.8 %, noise of 1 %": lambda folder: photographed(specimen(folder), white, 0.01),
-    "12.8 %, noise of 2 %": lambda folder: specimen(folder, noise=0.02),
+    "12.8 %, noise of 2 %": lambda folder: specimen(folder, sensor={"read_noise": 0.02}),
+    "12.8 %, pixels show means": lambda f: specimen(f, sensor={"fill_factor": 1.0}),
+    "12.8 %, pixels show means, noise of 1 %": lambda folder: photographed(
+        specimen(folder, sensor={"fill_factor": 1.0}), white, 0.01
+    ),
+    "12.8 %, lens of 0.7 px": lambda folder: specimen(folder, sensor=LENS),
+    "12.8 %, lens of 0.7 px, noise of 1 %": lambda folder: photographed(
+        specimen(folder, sensor=LENS), white, 0.01
+    ),
     "12.8 %, noise of 1 %, JPEG": lambda folder: photographed(specimen(folder), compressed, 0.01),
     "12.8 %, noise of 1 %, camera of colours": lambda folder: photographed(
         specimen(folder), colour, 0.01
@@ -244,6 +258,10 @@ CASES: dict[str, Callable[[Path], Images]] = {
         filled(folder, (2.4, -1.7), 3.0, 0.0), slice(200, 260), slice(300, 380)
     ),
     "turn by 10°": lambda folder: rigid(folder, (5.3, -8.6), 10.0),
+    "turn by 10°, lens of 0.7 px": lambda folder: rigid(folder, (5.3, -8.6), 10.0, camera=blurring),
+    "turn by 10°, lens of 0.7 px, speckle of 12 px, noise of 0.5 %": lambda folder: rigid(
+        folder, (5.3, -8.6), 10.0, 0.005, 2.5, blurring
+    ),
     "shift by 0.6 px, noise of 1 %": lambda folder: rigid(folder, (0.37, -0.41), 0.0, 0.01),
     "turn by 10°, noise of 1 %": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01),
     "the same, speckle of 12 px": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01, 2.5),

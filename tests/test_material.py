@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from modeharvest.idic.photograph.material import find_material
+from modeharvest.idic.photograph.material import find_material, mixed_edge_px
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.errors import InputError
 from modeharvest.util.masks import grown
@@ -33,6 +33,25 @@ def image(background: float, noise: float, mask: BoolArray, seed: int = 0) -> ND
     speckle = Speckle(SpeckleSpec(standard_deviation=0.06, blur_px=2.0, seed=seed), SHAPE).image()
     random = np.random.default_rng(seed + 1)
     return np.where(mask, speckle, background) + noise * random.normal(size=SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("lens_px", "noise", "low", "high"),
+    [(0.0, 0.002, 1, 1), (0.0, 0.01, 1, 1), (0.7, 0.002, 2, 3), (0.7, 0.01, 2, 2),
+     (1.2, 0.002, 3, 4), (1.2, 0.01, 2, 3)],
+)  # fmt: skip
+def test_rows_with_background_in_them(lens_px: float, noise: float, low: int, high: int) -> None:
+    mask, random = specimen(), np.random.default_rng(1)
+    for background in (0.0, 0.9):
+        grey = image(background, 0.0, mask)
+        grey = gaussian_filter(grey, lens_px) if lens_px else grey
+        grey = grey + noise * random.normal(size=SHAPE)
+        assert low <= mixed_edge_px(grey.astype(np.float32), mask) <= high
+    too_large = mixed_edge_px(grey.astype(np.float32), grown(mask, 1.0))
+    assert too_large == min(4, mixed_edge_px(grey.astype(np.float32), mask) + 1)
+    everywhere = image(0.0, noise, np.ones(SHAPE, np.bool_)).astype(np.float32)
+    assert mixed_edge_px(everywhere, mask) == 1  # a part of a surface is no edge of material
+    assert mixed_edge_px(everywhere, np.ones(SHAPE, np.bool_)) == 1
 
 
 def edge_distance(found: BoolArray, truth: BoolArray) -> NDArray[np.float64]:

@@ -80,9 +80,9 @@ _BLUR_PX, _SPECKLE = 1.5, 3.0
 """Blur of the reference, and least power of its slopes, over that of noise, with speckle."""
 _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which they don't match."""
-_OFF_PX, _AT_EDGE_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0), 1.0
-"""Possible error of edges after blocks of speckle, one for each first measurement (repeated until
-the images match everywhere, or twice no better), and before the last measurement."""
+_OFF_PX = (4.0, 2.0, 2.0, 2.0, 2.0, 2.0)
+"""Possible error of edges after blocks of speckle, one for each first measurement: these are
+repeated until the images match everywhere, or twice no better [px]."""
 
 
 class _Coarse(NamedTuple):
@@ -184,11 +184,11 @@ def displacement_from(
     coarse, light = first.with_its_light(light_degree)
     options = replace(options, first_px=coarse.cutoff_px)
     measured = partial(measure_displacement, on=body, options=options, progress=progress)
-    images = first.images(coarse.u, _AT_EDGE_PX, light)
+    images = first.images(coarse.u, options.edge_px, light)
     found = measured(images, coarse.start)
     u = on_pixels(pair.grid, body.mesh, found.displacement)
     if light != LOCAL and light_for(pair, u, light_degree) == LOCAL:  # the first one followed it
-        light, images = LOCAL, first.images(found.displacement, _AT_EDGE_PX, LOCAL)
+        light, images = LOCAL, first.images(found.displacement, options.edge_px, LOCAL)
         found = measured(images, coarse.start)
     found = replace(found, light=light)
     wave = (found.cutoff_px or 0.0) * pair.grid.pixel_size

@@ -12,9 +12,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, label, mean, uniform_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, label, mean, uniform_filter
+from scipy.optimize import least_squares
+from scipy.special import ndtr, ndtri
 from skimage.filters import threshold_otsu
 
+from modeharvest.idic.solver.final_smoothing import speckle_size
+from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.masks import connected_to, grown, large_parts, opened, shrunk
@@ -44,6 +48,12 @@ _WALL_WINDOW, _WALL_PX, _WALL_SHARPNESS = 0.6, 13, 0.3
 share of the material's fine contrast below which a region is out of focus."""
 _SLIGHTEST = 0.02
 """Share of material with grey levels of the background from which on that is reported."""
+_EDGE_PX, _STEP_PX = 4.0, 0.5
+"""Pixels farther from a mask's edge are material or background; steps of an edge's profile [px]."""
+AROUND_PX = 25.0
+"""Gaussian width of windows in which the background has one level [px]."""
+_SLIGHT, _MOST_SLIGHT = 2.0, 0.3
+"""What a row of pixels may show of the background, over the image's noise; largest such share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +105,46 @@ def find_material(
     if coat is not None:
         material = material | coat
     return MaterialMask(material, _text(material, ratio, alike, walls))
+
+
+def mixed_edge_px(image: FloatImage, mask: BoolArray) -> int:
+    """Distance from a mask's edge of pixels that show background, and of one row more [px].
+
+    Lens, finite pixels, and a mask that is too large mix background and material. The share of
+    background is fitted to the mean profile across the edge, as a Gaussian distribution function;
+    shares that hardly matter beside the noise don't count. At least 1, and at most 4.
+    """
+    inward = np.where(mask, distance_transform_edt(mask) - 0.5, 0.5 - distance_transform_edt(~mask))
+    material, background = inward > _EDGE_PX, inward < -_EDGE_PX
+    if not (material.any() and background.any()):
+        return 1
+    inside = mean_over(image, material, max(_EDGE_PX, speckle_size(image, material)))
+    near = abs(inward) < _EDGE_PX
+    contrast = (mean_over(image, background, AROUND_PX) - inside)[near]
+    at, place = np.unique(np.floor(inward[near] / _STEP_PX), return_inverse=True)
+    power, product, moment = (
+        np.bincount(place, contrast * part, at.size)
+        for part in (contrast, (image - inside)[near], contrast * inward[near])
+    )
+    typical = float(np.sqrt(np.mean(contrast**2)))
+    if typical < image[material].std():  # as where a mask ends within the speckle
+        return 1
+    share, x, weight = product / power, moment / power, np.sqrt(power / power.sum())
+    fit = least_squares(
+        lambda edge: weight * (ndtr((edge[0] - x) / edge[1]) - share), [0.0, 0.5],
+        bounds=([-_EDGE_PX, 0.01], [_EDGE_PX, _EDGE_PX]),
+    )  # fmt: skip
+    slight = np.clip(_SLIGHT * estimated_noise(image, mask).sd / typical, 1e-3, _MOST_SLIGHT)
+    mixed = float(fit.x[0] - fit.x[1] * ndtri(slight))
+    return int(np.clip(1.0 + mixed, 1.0, _EDGE_PX))
+
+
+def mean_over(grey: FloatImage, region: BoolArray, width: float) -> FloatImage:
+    """(rows, cols) mean grey level of a region's pixels around each, in a Gaussian window [px]."""
+    typical = np.float32(grey[region].mean()) if region.any() else np.float32(0.0)
+    total = gaussian_filter(np.where(region, grey - typical, np.float32(0.0)), width)
+    weight = gaussian_filter(region.astype(np.float32), width) + np.float32(1e-6)
+    return np.asarray(typical + total / weight, dtype=np.float32)
 
 
 def _checked(image: ArrayLike, window: int) -> FloatImage:

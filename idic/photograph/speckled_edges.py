@@ -23,6 +23,7 @@ from modeharvest.idic.finite_element.equations.system import SAMPLES, Body
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.result import refitted
 from modeharvest.idic.photograph.geometry import box_of
+from modeharvest.idic.photograph.material import AROUND_PX, mean_over
 from modeharvest.idic.photograph.plain.measure import displacement_between
 from modeharvest.idic.photograph.plain.surface import (
     CUT,
@@ -44,8 +45,8 @@ ELEMENTS_A_CELL = 5
 _SURE_PX, _BAND_PX = 2.0, 3.0
 """Pixels farther than this from a mask's edge are material or background, however wrong the mask
 is; and distance from that edge within which edges are searched."""
-_REACH_PX, _AROUND_PX, _BLUR_PX = 1.5, 25.0, 0.7
-"""Gaussian widths for the material's level, the background's level, and the least squares."""
+_REACH_PX, _BLUR_PX = 1.5, 0.7
+"""Gaussian widths for the material's level and the least squares."""
 _SMOOTHED = 1.0 / 6.0
 """Gaussian width of the windows that polynomials are fitted in, over an element's edge."""
 _STEP_PX = 0.5
@@ -133,8 +134,8 @@ def _share_of_material(grey: FloatImage, mask: BoolArray) -> tuple[FloatArray, F
     Where the material is as dark as the background the mask decides.
     """
     material, background = shrunk(mask, _SURE_PX), shrunk(~mask, _SURE_PX + 1.0)
-    inside = _mean_over(grey, material, _REACH_PX)
-    contrast = inside - _mean_over(grey, background, _AROUND_PX)
+    inside = mean_over(grey, material, _REACH_PX)
+    contrast = inside - mean_over(grey, background, AROUND_PX)
     narrow = mask & ~shrunk(mask, _SURE_PX + 1.0) & material  # as near to the edge as is sure
     ridge = np.float32(np.mean((grey - inside)[narrow] ** 2)) if narrow.any() else np.float32(1e-12)
     product = _blurred((grey - inside + contrast) * contrast + ridge * mask)
@@ -146,14 +147,6 @@ def _share_of_material(grey: FloatImage, mask: BoolArray) -> tuple[FloatArray, F
 
 def _blurred(image: FloatImage) -> FloatImage:
     return np.asarray(gaussian_filter(image, _BLUR_PX, output=np.float32))
-
-
-def _mean_over(grey: FloatImage, region: BoolArray, width: float) -> FloatImage:
-    """(rows, cols) mean grey level of a region's pixels around each."""
-    typical = np.float32(grey[region].mean()) if region.any() else np.float32(0.0)
-    total = gaussian_filter(np.where(region, grey - typical, np.float32(0.0)), width)
-    weight = gaussian_filter(region.astype(np.float32), width) + np.float32(1e-6)
-    return np.asarray(typical + total / weight, dtype=np.float32)
 
 
 def _smoothed(

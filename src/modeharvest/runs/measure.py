@@ -57,7 +57,7 @@ from modeharvest.idic.photograph.gauges import (
     reading_rows,
     write_gauges,
 )
-from modeharvest.idic.photograph.material import find_material
+from modeharvest.idic.photograph.material import find_material, mixed_edge_px
 from modeharvest.idic.photograph.plain.measure import displacement_of_plain, write_shapes
 from modeharvest.idic.photograph.plain.surface import MaterialContours, coat_of_paint, plain_surface
 from modeharvest.idic.solver.noise import ImageNoise
@@ -208,6 +208,11 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _body(self) -> Body:
         return Body(self.material.mesh, self.material.mask if self.case.mesh is None else None)
 
+    @cached_property
+    def _options(self) -> FiniteElementOptions:
+        mixed = mixed_edge_px(self.reference.image, self.material.mask)
+        return FiniteElementOptions(edge_px=mixed)
+
     def _material(self) -> MeshedMaterial:
         """Mesh the measurable part of the given mask, or of the material found by speckle."""
         given, options, image = self._given_mask, FiniteElementOptions(), self.reference.image
@@ -318,8 +323,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         names = str(self.case.reference), str(self.case.files[name])
         known = 0.0 * body.mesh.nodes if before is None else before.displacement
         start, light = block_motion(pair, body, known, names), Brightness.of(self.case.brightness)
-        return (displacement_from(start, pair, body, light_degree=light.degree,
-                                  progress=self.progress),)  # fmt: skip
+        return (displacement_from(start, pair, body, self._options, self.progress, light.degree),)
 
     def _with_roots(self) -> Iterator[tuple[str, NodalResult]]:
         """Name and displacement of each image, with the square roots of its covariance."""

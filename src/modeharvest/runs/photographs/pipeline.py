@@ -37,6 +37,7 @@ from modeharvest.idic.local.field import read_field, write_field
 from modeharvest.idic.photograph.axes import turned_sides
 from modeharvest.idic.photograph.gauges import along_axes, points_of, reading_rows, write_gauges
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
+from modeharvest.idic.photograph.material import mixed_edge_px
 from modeharvest.idic.photograph.measure import (
     MeasuredPhotograph,
     image_noise,
@@ -94,8 +95,6 @@ from modeharvest.util.stages import StagedRun, command_line, digest, exclusive, 
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import find_buckling, load_axis, mean_strain
 
-_EDGE_PX = 2
-"""A camera's pixels on an edge show some background, which removing distortion mixes further."""
 _ALONG = 120
 """Number of points of error bars along the longer side; they are as smooth as the ansatz."""
 _BOTH = "", "_speckle"
@@ -372,7 +371,8 @@ class HarvestRun(StagedRun[PhotographCase]):
     @cached_property
     def _mesh(self) -> tuple[Body, FiniteElementOptions]:
         """The mesh of the reference's material, and the options of measuring on it."""
-        how = replace(self.case.whole_field.on_mesh(), edge_px=_EDGE_PX)
+        mixed = mixed_edge_px(self.prepared.image(), self.prepared.mask())
+        how = replace(self.case.whole_field.on_mesh(), edge_px=mixed)
         return how.body(self.prepared.mask(), self.prepared.grid), how
 
     def _with_whole(
