@@ -65,7 +65,12 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
-from modeharvest.imaging.photographs.photograph import Photograph, read_frame, read_reference
+from modeharvest.imaging.photographs.photograph import (
+    Photograph,
+    read_frame,
+    read_reference,
+    require_any_frame,
+)
 from modeharvest.runs.photographs.machine_log import LogTable
 from modeharvest.runs.photographs.prepare import CODE, LIBRARIES
 from modeharvest.runs.photographs.sequence import (
@@ -339,6 +344,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         """Run every stage that is not finished; returns the content of ``summary.json``."""
         with exclusive(self.folder):
             require_writable(self.folder)
+            require_any_frame(tuple(self.case.files.values()), self.reference)
             gauges = read_gauges(self.case.gauges) if self.case.gauges else ()
             gauges = along_axes(gauges, self.case.angle)
             for gauge in gauges:  # InputError before measuring, if one is beside the material
