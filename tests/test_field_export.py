@@ -84,7 +84,7 @@ def test_a_converted_file_has_the_same_field_or_asks_for_what_it_lacks(
         try:
             found, _ = convert(path, out, form, *given)
         except InputError as error:
-            assert re.search("give (both|--image|--pixel-size)", str(error))
+            assert re.search("give (both|--image|--pixel-size)", str(error))  # noqa: PT017
             assert not out.exists()
         else:
             own = grid if given[1] or source == "gom" else PixelGrid.centred(60, 80, 1.0)
