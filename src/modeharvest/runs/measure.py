@@ -115,8 +115,8 @@ class MeasureCase:
     ``reference``, ``deformed``: image files; ``deformed`` in the order of the test, wildcards
     allowed. ``mask``: an image that is not black on material of the reference; None to find the
     material by its speckle. ``pixel_size`` [mm]; None for lengths in px. ``mesh``: file of a
-    plane mesh of the material, readable by meshio; None to mesh the mask. ``brightness``: degree, 0 to
-    6, of the polynomials for gain and offset over an image, or "none". ``gauges``: a TOML file of
+    plane mesh of the material that meshio reads; None to mesh the mask. ``brightness``: degree, 0
+    to 6, of the polynomials for gain and offset over an image, or "none". ``gauges``: TOML file of
     gauges for the report. ``angle``: from x to the specimen's axis, counter-clockwise [degrees]:
     mean strains, and those of gauges without an angle, are along it. ``sequence``: the files that
     the names stand for, if these are folders or videos; ``choice``: the command's options for
