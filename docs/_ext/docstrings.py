@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 ARGUMENT = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*) : (\S.*)$")
 LITERAL = re.compile(r"(``.*?``|:\w+:`[^`]*`)")
@@ -82,6 +83,8 @@ def restore(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: lis
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the functions before and after napoleon, whose priority is 500."""
+    # In unions Sphinx writes the repr of an alias.
+    TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # type: ignore[method-assign]
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-process-docstring", restore, priority=600)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
