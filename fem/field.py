@@ -37,9 +37,9 @@ NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
 _FLAT = 1e-6  # largest variation of z in a plane mesh, relative to its size
 MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
 
-_TRIANGLES = {
+_TRIANGLES: dict[str, dict[str, tuple[list[int], ...]]] = {
     "T3": {"triangle": ([0, 1, 2],), "quad": ([0, 1, 2], [0, 2, 3])},
-    "T6": {"triangle6": (slice(None),), "quad9": ([0, 1, 2, 4, 5, 8], [0, 2, 3, 8, 6, 7])},
+    "T6": {"triangle6": ([*range(6)],), "quad9": ([0, 1, 2, 4, 5, 8], [0, 2, 3, 8, 6, 7])},
 }
 """Nodes of the triangles into which cells are split."""
 

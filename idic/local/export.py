@@ -93,8 +93,8 @@ def convert(
     ``image``: the reference, for positions in px; ``pixel_size`` [mm]: to convert px and mm.
     InputError if the formats need either and it isn't given.
     """
-    shape = (1, 1) if image is None else read_image(image).shape
-    grid = PixelGrid.centred(*shape, pixel_size or 1.0)
+    rows, cols = (1, 1) if image is None else read_image(image).shape
+    grid = PixelGrid.centred(rows, cols, pixel_size or 1.0)
     field = read_field(source, None if image is None else grid)
     is_convertible = image is not None and pixel_size is not None
     in_px = form in FORMATS.keys() - {*_OF_GOM, *_OF_EITHER} or "px" in field.units
