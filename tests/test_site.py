@@ -141,7 +141,8 @@ def test_equations_are_markup(site: Path) -> None:
 def test_references_are_drawn_from_the_code(site: Path, page: str, texts: list[str]) -> None:
     text = (site / f"generated/{page}.html").read_text("utf-8")
     assert [t for t in texts if t.lower() not in text.lower()] == []
-    assert "TypeAliasForwardRef" not in text
+    # Left where Sphinx can't parse a signature, and links no type in it.
+    assert not re.findall(r"TypeAliasForwardRef|~modeharvest|&lt;factory&gt;", text)
 
 
 @pytest.mark.dolfinx
