@@ -21,7 +21,7 @@ help: ## Show this list
 demo: ## Reproduce the paper's virtual experiment in out/demo (open report.html)
 	$(ENV) modeharvest run paper-virtual --out $(OUT)
 
-docs: ## Build the documentation in docs/_build/html (a minute; the gallery's examples are run)
+docs: ## Build the documentation in docs/_build/html (minutes; the gallery's examples are run)
 	$(ENV) python -m sphinx -b html -W --keep-going -j 2 docs docs/_build/html
 
 dist: docs ## Make what a release consists of in dist: wheel, source archive, documentation

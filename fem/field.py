@@ -23,6 +23,7 @@ import numpy as np
 
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import FloatArray, FloatImage, IntArray
+from modeharvest.util.elements import shape_functions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
 from modeharvest.util.typed import made
@@ -35,6 +36,12 @@ COMPRESSED = {"compression": 1, "shuffle": True}
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
 _FLAT = 1e-6  # largest variation of z in a plane mesh, relative to its size
 MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
+
+_TRIANGLES: dict[str, dict[str, tuple[list[int], ...]]] = {
+    "T3": {"triangle": ([0, 1, 2],), "quad": ([0, 1, 2], [0, 2, 3])},
+    "T6": {"triangle6": ([*range(6)],), "quad9": ([0, 1, 2, 4, 5, 8], [0, 2, 3, 8, 6, 7])},
+}
+"""Nodes of the triangles into which cells are split."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +242,7 @@ def _read_snapshot(group: h5py.Group) -> Snapshot:
 
 def read_any_mesh(path: Path | str) -> meshio.Mesh:
     """Points, cells, named cell sets and nodal fields of a file in any format of meshio."""
-    what, remedy = "a mesh that meshio reads", "export it again"
+    what, remedy = "a mesh that meshio reads", "export it again, for example as VTU"
     found = read_in_child("mesh", path, what, remedy)
     with reading(path, what, remedy):
         named = [(name.split("/", 2), values) for name, values in found.items()]
@@ -272,10 +279,36 @@ def plane_mesh(source: meshio.Mesh, path: Path | str) -> Mesh:
     types = sorted({block.type for block in source.cells})
     found = [e for e, name in MESHIO_NAME.items() if name in types]
     if len(found) != 1:
-        known = list(MESHIO_NAME.values())
-        raise InputError(f"expected one type of cells among {known} in {path}, got {types}")
+        known = ", ".join(MESHIO_NAME.values())
+        raise InputError(
+            f"expected cells of one of the types {known} in {path}, got {', '.join(types)}; export "
+            "a plane mesh of one type"
+        )
     nodes = in_plane(source.points, f" in {path}")
     return Mesh(nodes, source.get_cells_type(MESHIO_NAME[found[0]]), found[0])
+
+
+def plane_triangles(source: meshio.Mesh, path: Path | str) -> Mesh:
+    """The T3 or T6 mesh of a file's content; quadrilaterals are split along a diagonal.
+
+    InputError if it isn't plane, or has linear beside quadratic cells, or none at all.
+    """
+    nodes, own = in_plane(source.points, f" in {path}"), dict(source.cells_dict)
+    if (eight := own.get("quad8")) is not None:  # the element's own centre
+        centres = shape_functions("Q8", [0.0, 0.0]) @ nodes[eight]
+        nine = np.column_stack([eight, len(nodes) + np.arange(len(eight))])
+        own["quad9"] = np.vstack([own.get("quad9", nine[:0]), nine])
+        nodes = np.vstack([nodes, centres])
+    found = {element: [own[name][:, part] for name, parts in types.items() if name in own
+                       for part in parts] for element, types in _TRIANGLES.items()}  # fmt: skip
+    cells = {element: np.vstack(parts) for element, parts in found.items() if parts}
+    if len(cells) != 1:
+        raise InputError(
+            f"expected a mesh of linear or of quadratic triangles or quadrilaterals in {path}, got "
+            f"{' and '.join(source.cells_dict) or 'no cells'}; export a plane mesh of one order"
+        )
+    ((element, all_cells),) = cells.items()
+    return Mesh(nodes, all_cells, element)
 
 
 def in_plane(points: FloatArray, where: str = "") -> FloatArray:

@@ -16,8 +16,17 @@ import numpy as np
 import pytest
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.field import Mesh, Snapshot, Solution, read_meshio
+from modeharvest.fem.field import (
+    Mesh,
+    Snapshot,
+    Solution,
+    plane_mesh,
+    plane_triangles,
+    read_any_mesh,
+    read_meshio,
+)
 from modeharvest.fem.specimen import Specimen
+from modeharvest.util.elements import shape_functions
 from modeharvest.util.errors import InputError
 
 RANDOM = np.random.default_rng(0)
@@ -176,7 +185,7 @@ def test_foreign_meshes_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nodal field 'u' in .*m.vtu, got \['U'\]"):
         read_meshio(path, "u", 0.1)
     write_meshio(path, [("tetra", np.array([[0, 1, 2, 3]]))], U=u)
-    with pytest.raises(InputError, match=r"cells among .*got \['tetra'\]"):
+    with pytest.raises(InputError, match=r"cells of one of the types .*got tetra"):
         read_meshio(path, "U", 0.1)
     write_meshio(path, [("quad", np.array([[0, 1, 2, 3]]))], U=u[:, 0])
     with pytest.raises(InputError, match=r"2 or 3 components"):
@@ -197,8 +206,43 @@ def test_mixed_meshes_are_refused(tmp_path: Path) -> None:
     points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0.0]])
     cells = [("quad", np.array([[0, 1, 2, 3]])), ("triangle", np.array([[1, 4, 2]]))]
     write_meshio(tmp_path / "m.vtu", cells, points, U=np.zeros((5, 3)))
-    with pytest.raises(InputError, match=r"one type of cells.*got \['quad', 'triangle'\]"):
+    with pytest.raises(InputError, match=r"cells of one of the types .*got quad, triangle; export"):
         read_meshio(tmp_path / "m.vtu", "U", 0.1)
+
+
+def test_quadrilaterals_are_split_to_measure_on() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0.0]])
+    cells = {"line": [[0, 1]], "quad": [[0, 1, 2, 3]], "triangle": [[1, 4, 2]]}
+    found = plane_triangles(meshio.Mesh(points, cells), "m.vtu")
+    assert found.element == "T3"
+    np.testing.assert_array_equal(found.cells, [[1, 4, 2], [0, 1, 2], [0, 2, 3]])
+    for wrong in ({"line": [[0, 1]]}, {"triangle6": [[0, 1, 2, 3, 4, 3]], "quad": [[0, 1, 2, 3]]}):
+        with pytest.raises(
+            InputError, match=r"in m\.vtu, got .*; export a plane mesh of one order"
+        ):
+            plane_triangles(meshio.Mesh(points, wrong), "m.vtu")
+
+
+def test_quadratic_quadrilaterals_are_split_through_their_centre() -> None:
+    """With curved sides; an element without a centre gets the node that its shape gives."""
+    corners, middles = [[0, 0], [4, 0], [5, 4], [0, 3]], [[2, -1], [4, 2], [2, 4], [-1, 2]]
+    points = np.pad(np.array([*corners, *middles], dtype=float), ((0, 0), (0, 1)))
+    found = plane_triangles(meshio.Mesh(points, {"quad8": [range(8)]}), "m.vtu")
+    assert found.element == "T6"
+    np.testing.assert_array_equal(found.cells, [[0, 1, 2, 4, 5, 8], [0, 2, 3, 8, 6, 7]])
+    centre = shape_functions("Q8", [0.0, 0.0]) @ points[:, :2]
+    np.testing.assert_allclose(found.nodes[8], centre)
+    nine = meshio.Mesh(np.pad(found.nodes, ((0, 0), (0, 1))), {"quad9": [range(9)]})
+    np.testing.assert_array_equal(plane_triangles(nine, "m.vtu").cells, found.cells)
+
+
+@pytest.mark.parametrize("kind", ["CPE4", "CPE4RH", "CPS4I", "S4R"])
+def test_plane_elements_of_abaqus_are_read(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "a.inp").write_text(
+        f"*Node\n1, 0, 0\n2, 1, 0\n3, 1, 1\n4, 0, 1\n*Element, type={kind}\n1, 1, 2, 3, 4\n"
+    )
+    mesh = plane_mesh(read_any_mesh(tmp_path / "a.inp"), "a.inp")
+    assert (mesh.element, mesh.cells.tolist()) == ("Q4", [[0, 1, 2, 3]])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +11,10 @@ import pytest
 from scipy.io import loadmat
 from scipy.linalg import logm, sqrtm
 
-from modeharvest.idic.local.export import FORMATS, export_field
+from modeharvest.idic.local.export import FORMATS, convert, export_field
 from modeharvest.idic.local.field import LocalField, read_field
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.photographs.files import write_image
 from modeharvest.util.errors import InputError
 
 GRID = PixelGrid(60, 80, 0.05, -1.3, 2.1)
@@ -62,6 +64,33 @@ def test_millimetres_need_the_size_of_a_pixel(tmp_path: Path) -> None:
         export_field(tmp_path / "field", FIELD, "gom", GRID, "px")
     with pytest.raises(InputError, match="expected a format among ncorr"):
         export_field(tmp_path / "field", FIELD, "vic", GRID)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("source", ["gom", "matchid", "vic2d"])
+def test_a_converted_file_has_the_same_field_or_asks_for_what_it_lacks(
+    tmp_path: Path, source: str, form: str
+) -> None:
+    """Millimetres were written as pixels where the image or the size of a pixel wasn't given."""
+    grid = PixelGrid.centred(60, 80, 0.05)
+    x, y = grid.to_mm(ROW, COL)
+    path = export_field(tmp_path / source, replace(FIELD, x=x, y=y), source, grid)
+    write_image(image := tmp_path / "ref.tif", np.arange(4800.0).reshape(grid.shape))
+    found, field = convert(path, tmp_path / "all", form, image, 0.05)
+    assert field.units == {"gom": {"mm"}, "matchid": {"px", "mm"}, "vic2d": {"px"}}[source]
+    np.testing.assert_allclose(read_field(found, grid).valid_points()[2], U[GOOD], atol=1e-9)
+    for what, given in {"none": (None, None), "image": (image, None), "px": (None, 0.05)}.items():
+        out = tmp_path / what
+        try:
+            found, _ = convert(path, out, form, *given)
+        except InputError as error:
+            assert re.search("give (both|--image|--pixel-size)", str(error))  # noqa: PT017
+            assert not out.exists()
+        else:
+            own = grid if given[1] or source == "gom" else PixelGrid.centred(60, 80, 1.0)
+            scale = own.pixel_size / grid.pixel_size
+            u = read_field(found, own).valid_points()[2]
+            np.testing.assert_allclose(u, scale * U[GOOD], atol=1e-7)
 
 
 TURN, STRETCH = np.radians(20.0), np.array([[1.25, 0.1], [0.1, 0.8]])

@@ -144,7 +144,8 @@ def ncorr(scale: float) -> dict[str, FloatArray]:
 def test_ncorr_in_both_versions_of_mat(tmp_path: Path, scale: float) -> None:
     info = {"pixtounits": scale, "spacing": 7.0, "units": "mm"}
     first = {name: 0.5 * a for name, a in ncorr(scale).items()}
-    one = {"data_dic_save": {"displacements": ncorr(scale), "dispinfo": info}}
+    region = {"roi_dic": {"mask": np.ones((3, 4))}}  # a structure, if its object was converted
+    one = {"data_dic_save": {"displacements": ncorr(scale) | region, "dispinfo": info}}
     two = {"data_dic_save": {"displacements": [first, ncorr(scale)], "dispinfo": info}}
     kind = [(name, "O") for name in first]
     array = np.array([tuple(first.values()), tuple(ncorr(scale).values())], dtype=kind)

@@ -151,6 +151,11 @@ def test_a_table_of_a_sequence(tmp_path: Path) -> None:
         ('[[gauges]]\nname = "a"\npoints = [1, 0]', "did you mean 'point'"),
         ('[[gauges]]\nname = ""\npoint = [1, 0]', "expected a name"),
         ("[[gauges", "expected gauges (TOML)"),
+        ('[gauges]\nname = "a"\npoint = [1, 0]', "got [gauges]; write two brackets"),
+        ('[[gauges]]\nname = "a"\npoint = [1, 0, 0]', "point: expected at most 2 values, got [1"),
+        ('[[gauges]]\nname = "a"\npoint = "1, 0"', "point: expected a list, got '1, 0'"),
+        ('[[gauges]]\nname = 1\npoint = [1, 0]', "name: expected a text, got 1"),
+        ('gauges = ["a"]', "gauges: expected a table, got 'a'"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_gauges_is_one_line(tmp_path: Path, text: str, words: str) -> None:
@@ -161,9 +166,19 @@ def test_what_is_wrong_with_gauges_is_one_line(tmp_path: Path, text: str, words:
     assert "\n" not in str(caught.value)
 
 
+def test_a_byte_order_mark_and_any_order_of_keys_are_read(tmp_path: Path) -> None:
+    text = '\ufeff[[gauges]]\r\nangle = 5\r\npoint = [1, 2]\r\nname = "a"\r\n'
+    (tmp_path / "gauges.toml").write_bytes(text.encode())
+    assert read_gauges(tmp_path / "gauges.toml") == (Gauge("a", point=(1.0, 2.0), angle=5.0),)
+
+
 def test_gauges_beside_the_material_are_named() -> None:
     found = result(affine(STRETCH))
     with pytest.raises(InputError, match=r"gauge 'P': expected it on the material, got it beside"):
         read_at(Gauge("P", point=(9.0, 0.0)), found)
-    with pytest.raises(InputError, match=r"x = -5.5 to 5.5 and y = -3.5 to 3.5"):
+    with pytest.raises(InputError, match=r"x = -5.5 to 5.5 and y = -3.5 to 3.5, y up; for \[col"):
         read_at(Gauge("A", polygon=((9.0, 0.0), (9.5, 0.0), (9.0, 1.0))), found)
+    with pytest.raises(InputError, match=r"row = 5 to 75 and column = 5 to 115$"):
+        read_at(Gauge("P", point=(200.0, 10.0), pixels=True), found)
+    with pytest.raises(InputError, match="an area of 1 px or more, got less"):
+        read_at(Gauge("A", polygon=((0.0, 0.0), (1.0, 0.0), (2.0, 0.0))), found)

@@ -158,6 +158,31 @@ def test_it_is_one_line_and_nothing_is_lost(
     assert not (out / "summary.json").exists()
 
 
+@pytest.mark.parametrize("command", ["measure", "harvest"])
+@pytest.mark.parametrize("content", [b"", b"<!DOCTYPE html>", b"half", b"small"])
+def test_damaged_images_alone_leave_no_folder(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    content: bytes, command: str,
+) -> None:  # fmt: skip
+    frames = sorted(folder.glob("frame_*.tif"))
+    for path in frames:
+        whole = path.read_bytes()
+        path.write_bytes(whole[: len(whole) // 2] if content == b"half" else content)
+        if content == b"small":
+            tifffile.imwrite(path, SMALL)
+    photographs = map(str, (folder / "reference.tif", *frames))
+    inputs = photographs if command == "measure" else [str(folder / "experiment.toml")]
+    argv = ["modeharvest", command, *inputs, "--out", str(folder / "new/out")]
+    monkeypatch.setattr(sys, "argv", argv)
+    with pytest.raises(SystemExit) as end:
+        main()
+    (line,) = [row for row in capsys.readouterr().err.splitlines() if row.startswith("error:")]
+    assert end.value.code == 2
+    assert "none of 3 deformed images can be used; the first: " in line
+    assert str(frames[0]) in line
+    assert not (folder / "new").exists()
+
+
 def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
     """A constant one, one of 16 bits, and one whose mask is of another size."""
     shape = photographed().grid.shape

@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 172, 35_773
+MOST_MODULES, MOST_LINES = 172, 35_852
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
@@ -83,8 +83,8 @@ OWN_BOUNDS = {
     HOMOGENIZATION: (19, 3_820), OWN_CELLS: (7, 960), IDENTIFICATION: (19, 4_073),
     DESIGN: (6, 856),
     FIRST_TOUCH: (3, 350),
-    CONTOURS: (17, 4_478), SEQUENCES: (12, 3_037), EXPLORE: (2, 306), SHARED_DATA: (3, 471),
-    GAUGES_AND_FORMATS: (9, 2_040),
+    CONTOURS: (17, 4_478), SEQUENCES: (12, 3_086), EXPLORE: (2, 306), SHARED_DATA: (3, 471),
+    GAUGES_AND_FORMATS: (9, 2_067),
     WHOLE_DISPLACEMENT: (13, 2_720),
 }  # fmt: skip
 """Modules and lines of capabilities that came later, with the modules that they are built into."""

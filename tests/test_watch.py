@@ -20,9 +20,10 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import square_family
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.report.figures.sequence import watch_text
 from modeharvest.runs.photographs.watch import WatchedTest, arriving, watch
 from modeharvest.util.errors import InputError
-from modeharvest.validation.growth import Prediction, follow_growth, predict
+from modeharvest.validation.growth import Prediction, fastest_growth, follow_growth, predict
 
 PITCH, PIXEL = 1.9, 0.035
 CRITICAL = 0.06
@@ -124,6 +125,35 @@ def test_a_prediction_stays_once_buckling_is_near() -> None:
     assert found[-1].largest < 0.1
 
 
+def pitchfork(load: np.ndarray, imperfection: float) -> np.ndarray:
+    """Amplitudes a > 0 of an imperfect pitchfork, a^3 = (p / 0.1 - 1) a + imperfection p / 0.1."""
+    roots = [np.roots([1.0, 0.0, 1.0 - p / 0.1, -imperfection * p / 0.1]) for p in load]
+    return np.array([r[abs(r.imag) < 1e-9].real.max() for r in roots])
+
+
+@pytest.mark.parametrize("imperfection", [0.001, 0.005, 0.02])
+def test_a_pattern_that_has_grown_more_slowly_has_buckled(imperfection: float) -> None:
+    """Predictions followed the slower growth away from the critical load, up to twice that."""
+    load, sd = np.linspace(0.005, 0.15, 30), np.full(30, 0.002)
+    columns = np.array([load, pitchfork(load, imperfection), sd, sd])
+    assert all(fastest_growth(columns[:, :n]) is None for n in range(1, 20))
+    fastest = fastest_growth(columns)
+    assert fastest is not None
+    assert fastest[0] == pytest.approx(0.1, abs=0.0051)
+    assert fastest_growth(columns[:, [*range(30), *range(20, 0, -1)]]) == fastest  # unloaded
+    last = follow_growth(columns)[-1]
+    assert last is None or (last.largest < 0.1 and last.critical < 0.12)
+
+
+def test_growth_before_buckling_is_not_taken_for_its_end() -> None:
+    load, random = np.linspace(0.004, 0.09, 40), np.random.default_rng(4)
+    for mean in (grown(load), grown(load, -40.0), 300.0 * load, 300.0 * load - 1500.0 * load**2):
+        for sd in (0.02, 0.5):
+            amplitude = mean + sd * random.normal(size=40)
+            columns = np.array([load, amplitude, *np.full((2, 40), sd)])
+            assert all(fastest_growth(columns[:, :n]) is None for n in range(1, 41))
+
+
 # -- watching ----------------------------------------------------------------------------
 
 
@@ -197,7 +227,7 @@ def test_the_page_holds_all_and_reloads_until_the_end(
     out, test = watched
     page = (out / "watch.html").read_text("utf-8")
     assert page.count("<svg") == 3
-    assert "It buckles at" in page
+    assert "Buckling is predicted at" in page
     assert "http-equiv" not in page
     assert "src=" not in page
     # A curve of a colour that the page doesn't know isn't there.
@@ -208,8 +238,23 @@ def test_the_page_holds_all_and_reloads_until_the_end(
 
     write_watch_page(tmp_path / "watch.html", "<b>", WatchedTest(test.rows[:1]), None)
     page = (tmp_path / "watch.html").read_text("utf-8")
+    assert "1 photograph, the last" in page
     assert 'http-equiv="refresh"' in page
     assert "&lt;b&gt;" in page
+
+
+def test_words_before_at_and_after_buckling(watched: tuple[Path, WatchedTest]) -> None:
+    rows = watched[1].rows
+    assert "This strain is reached" not in watch_text(WatchedTest(rows))
+    assert "This strain is reached." in watch_text(
+        WatchedTest([*rows, rows[-1] | {"strain": 1.1 * CRITICAL, "amplitude_mm": 4.0}])
+    )
+    strains = CRITICAL * np.linspace(0.05, 1.5, 30)
+    shown = zip(strains, pitchfork(0.1 * strains / CRITICAL, 0.005), strict=True)
+    after = [rows[0] | {"strain": p, "amplitude_mm": a, "sd_mm": 2e-3} for p, a in shown]
+    text = watch_text(WatchedTest(after))
+    assert "The specimen has buckled: the pattern grew fastest from 6.00 to 6.30 %." in text
+    assert "Buckling is predicted" not in text
 
 
 def test_it_goes_on_where_it_stopped(watched: tuple[Path, WatchedTest], experiment: Path) -> None:

@@ -38,6 +38,9 @@ _FAR, _NEGLIGIBLE = 10.0, 0.02
 """Largest p_c tried, in largest loads; relative density there above which p_c has no upper end."""
 _TRIED, _ROUNDS = 2000, 4
 _POINTS = 41
+_STEP, _BEFORE, _SLOWER, _CERTAIN = 0.02, 0.5, 0.9, 3.0
+"""Least step between images whose growth is compared, in largest loads; rates of growth before and
+after buckling at most, relative to the largest, and by how many standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -125,17 +128,45 @@ def predict(columns: FloatArray) -> Prediction | None:
     return Prediction(critical, critical - below, high, a0, others, most, len(load))
 
 
+def fastest_growth(columns: FloatArray) -> tuple[float, float] | None:
+    """The loads between which the amplitude grew fastest, once the pattern has buckled; else None.
+
+    ``columns`` (4, n): as for :func:`predict`, in the order of the test. Towards buckling a pattern
+    grows faster, here at least twice as fast as before, and after it more slowly, here by a tenth
+    in the last two steps; both beyond noise.
+    """
+    load, amplitude, sd, _ = columns[:, np.isfinite(columns).all(axis=0)]
+    if not load.size or load.max() <= 0.0:
+        return None
+    loading = np.flatnonzero(load[: int(np.argmax(load)) + 1] >= 0.0)
+    _, first = np.unique((load[loading] / load.max() / _STEP).astype(int), return_index=True)
+    load, amplitude, sd = (part[loading][first] for part in (load, amplitude, sd))
+    if len(load) < FEWEST:
+        return None
+    rate = np.diff(amplitude) / np.diff(load) * np.sign(amplitude[-1])
+    rate_sd = np.hypot(sd[1:], sd[:-1]) / np.diff(load)
+    k = int(np.argmax(rate))
+    apart = rate + _CERTAIN * np.hypot(rate_sd, rate_sd[k])
+    has_grown = k > 0 and apart[:k].min() < _BEFORE * rate[k]
+    is_over = k < len(rate) - 2 and apart[-2:].max() < _SLOWER * rate[k]
+    return (float(load[k]), float(load[k + 1])) if has_grown and is_over else None
+
+
 def follow_growth(
     columns: FloatArray, known: Sequence[Prediction | None] = ()
 ) -> list[Prediction | None]:
     """The prediction after each image of a test, in order; ``known``: those of the first images.
 
     ``columns`` (4, n): as for :func:`predict`. A prediction is kept once the load exceeds nine
-    tenths of it, because buckling is then no longer ahead, and during unloading.
+    tenths of it, because buckling is then no longer ahead, and during unloading. Once the growth
+    has slowed down, the last one from before it did is kept.
     """
     found = list(known)
     for n in range(len(found) + 1, columns.shape[1] + 1):
         load, last = columns[0, :n], found[-1] if found else None
         is_ahead = last is None or not last.is_useful or load[-1] < NEAR * last.critical
+        if (fastest := fastest_growth(columns[:, :n])) is not None:
+            before = (p for p in reversed(found) if p is not None and p.largest <= fastest[0])
+            is_ahead, last = False, next(before, None)
         found.append(predict(columns[:, :n]) if is_ahead and load[-1] >= load.max() else last)
     return found

@@ -7,8 +7,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 ARGUMENT = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*) : (\S.*)$")
+VALIDATED = re.compile(r"~?typing\.Annotated\[(.+?), ~?pydantic[\w.]+Validator\(.*?\)\]")
 LITERAL = re.compile(r"(``.*?``|:\w+:`[^`]*`)")
 
 
@@ -80,8 +82,21 @@ def restore(_app: Any, what: str, _name: str, _thing: Any, _how: Any, lines: lis
                 return
 
 
+def parsable(_app: Any, _what: str, _name: str, _thing: Any, _how: Any, signature: str | None,
+             returned: str | None) -> tuple[str | None, str | None]:  # fmt: skip
+    """A signature that Python can parse, without which Sphinx links no type in it."""
+    if signature is not None:
+        signature = VALIDATED.sub(r"\1", signature)
+        signature = re.sub(r"<function (\w+)[^<>]*>", r"\1", signature)
+        signature = re.sub(r"<[^<>]*>", "...", signature)  # <factory> of a default
+    return signature, returned
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the functions before and after napoleon, whose priority is 500."""
+    # In unions Sphinx writes the repr of an alias.
+    TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # type: ignore[method-assign]
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-process-docstring", restore, priority=600)
+    app.connect("autodoc-process-signature", parsable)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from modeharvest.idic.local.field import LocalField, columns_of, write_field
+from modeharvest.idic.local.field import LocalField, columns_of, read_field, write_field
 from modeharvest.idic.local.formats import layouts
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.photographs.files import read_image
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic
@@ -31,6 +32,8 @@ FORMATS = {"ncorr": ".mat", "vic2d": ".csv", "davis": ".txt", "dice": ".txt", "m
 """Suffix of each format, by the format's name in commands."""
 _OF_GOM = "gom", "aramis"
 """Formats in mm, y up."""
+_OF_EITHER = "csv", "mat", "npz"
+"""Formats of this project: in mm, y up, or in px, y down."""
 
 
 Tensors = Mapping[str, FloatArray]
@@ -57,7 +60,7 @@ def export_field(
         raise InputError(f"expected the size of a pixel for {form}, in mm; give --pixel-size")
     path = Path(path).with_suffix(FORMATS[form])
     texts, in_px = layouts()["written"], f"{form}_px"
-    is_down = form not in _OF_GOM and not (form in ("csv", "mat", "npz") and unit == "mm")
+    is_down = form not in _OF_GOM and not (form in _OF_EITHER and unit == "mm")
     strains = _components(tensors or {}, field, is_down)
     numbers = _numbers(field, grid, strains)
     if form in texts:
@@ -80,6 +83,28 @@ def export_field(
         with atomic(path) as part:
             savemat(part, content, appendmat=False, do_compression=True, oned_as="column")
     return path
+
+
+def convert(
+    source: Path, folder: Path, form: str, image: Path | None, pixel_size: float | None
+) -> tuple[Path, LocalField]:
+    """Write a field of any code as ``form``; returns the file, and the field as it was read.
+
+    ``image``: the reference, for positions in px; ``pixel_size`` [mm]: to convert px and mm.
+    InputError if the formats need either and it isn't given.
+    """
+    rows, cols = (1, 1) if image is None else read_image(image).shape
+    grid = PixelGrid.centred(rows, cols, pixel_size or 1.0)
+    field = read_field(source, None if image is None else grid)
+    is_convertible = image is not None and pixel_size is not None
+    in_px = form in FORMATS.keys() - {*_OF_GOM, *_OF_EITHER} or "px" in field.units
+    if "mm" in field.units and in_px and not is_convertible:
+        raise InputError(
+            f"{source}: expected --image (the reference) and --pixel-size (in mm) to write {form} "
+            f"from a field in {' and '.join(sorted(field.units))}; give both"
+        )
+    unit = "px" if pixel_size is None and "px" in field.units else "mm"
+    return export_field(folder / source.stem, field, form, grid, unit), field
 
 
 def _components(tensors: Tensors, field: LocalField, is_down: bool) -> Columns:

@@ -42,6 +42,8 @@ class LocalField:
     source: str = ""
     convention: str = ""
     """Recognised convention of its file, in one sentence; empty if that was declared."""
+    units: frozenset[str] = frozenset()
+    """Units of lengths in its file, "px", "mm" or both; empty if it was made without a file."""
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "u", "sd"):
@@ -136,7 +138,7 @@ class LocalField:
         sd = None if self.sd is None else self.sd[keep]
         return LocalField(
             self.x[keep], self.y[keep], self.u[keep], self.good[keep], sd, self.source,
-            self.convention,
+            self.convention, self.units,
         )  # fmt: skip
 
     def scaled(self, factor: float) -> LocalField:
@@ -232,7 +234,7 @@ def read_field(
     up_or_down = _declared("y_axis", _AXES, [*positions, chosen["v"]], y_axis, str(path))
     down = up_or_down == "down"
     if "px" in (position, motion) and grid is None:
-        raise InputError(f"{path}: expected a grid for a field in pixels; give the pixel size")
+        raise InputError(f"{path}: expected the image of a field in px; give --image, or a grid")
     x, y, u, v = _same_shape([table[chosen[role].name] for role in ROLES], chosen, str(path))
     sign = -1.0 if down else 1.0
     if position == "px" and grid is not None:
@@ -244,7 +246,7 @@ def read_field(
     sd, ok = _quality(table, chosen, x.size, scale, motion == "px", str(path))
     u = scale * np.column_stack([u, sign * v])
     text = "" if known is None else str(known)
-    return LocalField(x, y, u, ok, sd, source=Path(path).name, convention=text)
+    return LocalField(x, y, u, ok, sd, Path(path).name, text, frozenset((position, motion)))
 
 
 def write_field(

@@ -250,9 +250,10 @@ def _ncorr_frames(path: Path) -> tuple[list[Table], Table]:
     values = _in_version_73(path) if h5py.is_hdf5(path) else read_mat(path)
     frames: dict[int, Table] = {}
     for name, array in values.items():
-        number, _, last = name.removeprefix(_DISPLACEMENTS).strip("/").rpartition("/")
-        if name.startswith(_DISPLACEMENTS) and array.dtype.kind in "fiub":
-            frames.setdefault(int(number or 0), {})[last] = np.asarray(array, dtype=np.float64)
+        place = re.fullmatch(rf"{_DISPLACEMENTS}(/\d+)?/(\w+)", name)  # deeper are regions' parts
+        if place and array.dtype.kind in "fiub":
+            number, last = int((place[1] or "/0")[1:]), place[2]
+            frames.setdefault(number, {})[last] = np.asarray(array, dtype=np.float64)
     info = {n.removeprefix(_INFO): a for n, a in values.items() if n.startswith(_INFO)}
     return [frames[k] for k in sorted(frames)], info
 

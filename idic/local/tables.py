@@ -350,7 +350,7 @@ def choose(
     if missing:
         raise InputError(
             f"{where}: expected columns for {', '.join(missing)}, got {_listed(names)}; "
-            "name them in columns"
+            "call them x, y, u and v in the file, or name them in columns"
         )
     return chosen
 

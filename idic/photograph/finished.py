@@ -25,7 +25,7 @@ from modeharvest.imaging.photographs.files import read_mask
 from modeharvest.imaging.photographs.photograph import read_photograph
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import atomic, make_folder, open_hdf5, read_json
+from modeharvest.util.files import atomic, open_hdf5, read_json
 from modeharvest.util.typed import nearest
 
 
@@ -116,7 +116,6 @@ class FinishedRun:
         given, written = nodal.Given(self.unit), list[Path]()
         if pixel_size is not None and self.unit == "mm":
             raise InputError("expected --pixel-size for lengths in px, got a run measured in mm")
-        make_folder(folder)
         for name, file in self.files.items():
             path = folder / name
             if file.suffix == ".json":

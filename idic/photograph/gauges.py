@@ -90,9 +90,10 @@ Readings = dict[str, GaugeReading]
 def read_gauges(path: Path | str) -> tuple[Gauge, ...]:
     """Read [[gauges]] from a TOML file; InputError if there are none, or one is wrong."""
     with reading(path, "gauges (TOML)", "write [[gauges]] with name and point, line or polygon"):
-        tables = tomllib.loads(Path(path).read_text("utf-8")).get("gauges")
-    if not tables:
-        raise InputError(f"{path}: expected [[gauges]], got none")
+        tables = tomllib.loads(Path(path).read_text("utf-8-sig")).get("gauges")
+    if not tables or isinstance(tables, dict):
+        got = "[gauges]; write two brackets" if tables else "none"
+        raise InputError(f"{path}: expected [[gauges]], got {got}")
     try:
         return distinct(made(Gauge, table) for table in tables)
     except InputError as error:
@@ -187,16 +188,22 @@ def points_of(gauge: Gauge, grid: PixelGrid, mesh: Mesh) -> FloatArray:
         x, y = (np.arange(a + 0.5 * step, b, step) for a, b in zip(low, high, strict=True))
         points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         points = points[points_in_poly(points, corners)]  # type: ignore[no-untyped-call]
+        if not len(points):
+            raise InputError(f"gauge {gauge.name!r}: expected an area of 1 px or more, got less")
     else:
         points = corners
     on: BoolArray = located(mesh, points)[0] >= 0
     if gauge.polygon:
         points, on = points[on], on[on]
     if not (on.any() and on[0] and on[-1]):
-        (left, bottom), (right, top) = np.quantile(mesh.nodes, [0, 1], axis=0)
+        ends, names, more = mesh.nodes, ("x", "y"), ", y up; for [column, row] write pixels = true"
+        if gauge.pixels:
+            ends, names, more = np.column_stack(grid.to_px(*ends.T)), ("row", "column"), ""
+        ranges = zip(names, ends.min(axis=0), ends.max(axis=0), strict=True)
+        lies = " and ".join(f"{name} = {low:.4g} to {high:.4g}" for name, low, high in ranges)
         raise InputError(
             f"gauge {gauge.name!r}: expected it on the material, got it beside; the material lies "
-            f"in x = {left:.4g} to {right:.4g} and y = {bottom:.4g} to {top:.4g}, y up"
+            f"in {lies}{more}"
         )
     return np.asarray(points)
 

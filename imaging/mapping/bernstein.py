@@ -155,6 +155,6 @@ def require_positive_jacobian(
         raise InputError(
             f"{where}: expected {element} elements with positive Jacobians (nodes "
             f"counter-clockwise, not folded), got {bad.size} without, the first is element "
-            f"{bad[0]} near ({centre[0]:.4g}, {centre[1]:.4g}); repair the mesh or take a "
-            "smaller displacement"
+            f"{bad[0]} near ({centre[0]:.4g}, {centre[1]:.4g}); repair the mesh (or, "
+            "of a deformed one, take a smaller displacement)"
         )

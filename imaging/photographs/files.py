@@ -73,7 +73,7 @@ def read_stored(path: Path, *, single: bool = False) -> StoredImage:
     The first page of a multi-page file is read, unless ``single``, which allows only one page.
     InputError if the file is missing, empty, damaged, or its levels can't be read unchanged.
     """
-    remedy = "if it is a damaged file, or cut short, copy it or make it again"
+    remedy = "if it is a damaged file, or one cut short, copy or export it again"
     with reading(path, "a TIFF, PNG or JPEG image", remedy), warnings.catch_warnings():
         warnings.simplefilter("error")  # Pillow warns of files cut short
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # size is checked here

@@ -6,6 +6,7 @@ float TIFF, PNG and JPEG are read; changes made when reading are in ``Photograph
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -190,6 +191,23 @@ def read_frame(path: Path | str, reference: Photograph) -> Photograph:
     """
     frame = require_alike(reference, read_photograph(path))
     return replace(frame, notes=frame.notes + require_usable(frame))
+
+
+def require_any_frame(paths: Sequence[Path], reference: Photograph) -> None:
+    """Raise InputError, with the first file's reason, if no frame can be used.
+
+    To be called before files are written, so that a run without any image leaves none.
+    """
+    reasons = []
+    for path in paths:
+        try:
+            read_frame(path, reference)
+        except InputError as error:
+            reasons.append(str(error))
+        else:
+            return
+    none = f"none of {len(paths)} deformed images can be used; the first: " * (len(paths) > 1)
+    raise InputError(none + reasons[0])
 
 
 def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> float:

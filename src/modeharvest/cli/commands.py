@@ -260,7 +260,7 @@ def measure(
         float | None, typer.Option(help="Edge of a pixel in mm; without it, lengths are in px.")
     ] = None,
     mesh: Annotated[
-        Path | None, typer.Option(help="Mesh of triangles: origin in the image's middle, y up.")
+        Path | None, typer.Option(help="Plane mesh: origin in the image's middle, y up.")
     ] = None,
     brightness: Annotated[
         str, typer.Option(help="Degree of gain and offset over x, y: 0 to 6, or none.", metavar="N")

@@ -35,12 +35,8 @@ def export(
 
     Other codes' fields are recognised and converted; the conventions found are printed.
     """
-    from modeharvest.idic.local.export import export_field
-    from modeharvest.idic.local.field import read_field
+    from modeharvest.idic.local.export import convert
     from modeharvest.idic.photograph.finished import FinishedRun
-    from modeharvest.imaging.grid import PixelGrid
-    from modeharvest.imaging.photographs.files import read_image
-    from modeharvest.util.files import make_folder
 
     if source.is_dir() or source.suffix in (".h5", ""):
         if image:
@@ -48,14 +44,11 @@ def export(
         finished = FinishedRun.read(source, correlations=True)
         written = finished.export(form, out, step, pixel_size)
     else:
-        rows, cols = (1, 1) if image is None else read_image(image).shape
-        grid = PixelGrid.centred(rows, cols, pixel_size or 1.0)
-        field = read_field(source, None if image is None else grid)
-        make_folder(out)
-        unit = "px" if image and not pixel_size else "mm"
-        written = [export_field(out / source.stem, field, form, grid, unit)]
+        path, field = convert(source, out, form, image, pixel_size)
+        written = [path]
         print(field.read_as)
-    print(f"{len(written)} files in {out}, the first is {written[0].name}")
+    files = "1 file" if len(written) == 1 else f"{len(written)} files"
+    print(f"{files} in {out}, the first is {written[0].name}")
 
 
 def gauges(

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from modeharvest.fem.field import Mesh, plane_mesh, read_any_mesh, read_mesh, write_mesh
+from modeharvest.fem.field import Mesh, plane_triangles, read_any_mesh, read_mesh, write_mesh
 from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.finite_element.equations.system import Body
 from modeharvest.idic.finite_element.files import (
@@ -65,7 +65,12 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
-from modeharvest.imaging.photographs.photograph import Photograph, read_frame, read_reference
+from modeharvest.imaging.photographs.photograph import (
+    Photograph,
+    read_frame,
+    read_reference,
+    require_any_frame,
+)
 from modeharvest.runs.photographs.machine_log import LogTable
 from modeharvest.runs.photographs.prepare import CODE, LIBRARIES
 from modeharvest.runs.photographs.sequence import (
@@ -81,6 +86,7 @@ from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.files import (
     atomic_hdf5,
     open_hdf5,
+    reading,
     require_file,
     require_writable,
     sha256_of,
@@ -108,9 +114,9 @@ class MeasureCase:
 
     ``reference``, ``deformed``: image files; ``deformed`` in the order of the test, wildcards
     allowed. ``mask``: an image that is not black on material of the reference; None to find the
-    material by its speckle. ``pixel_size`` [mm]; None for lengths in px. ``mesh``: file of a T3 or
-    T6 mesh of the material, readable by meshio; None to mesh the mask. ``brightness``: degree, 0 to
-    6, of the polynomials for gain and offset over an image, or "none". ``gauges``: a TOML file of
+    material by its speckle. ``pixel_size`` [mm]; None for lengths in px. ``mesh``: file of a
+    plane mesh of the material that meshio reads; None to mesh the mask. ``brightness``: degree, 0
+    to 6, of the polynomials for gain and offset over an image, or "none". ``gauges``: TOML file of
     gauges for the report. ``angle``: from x to the specimen's axis, counter-clockwise [degrees]:
     mean strains, and those of gauges without an angle, are along it. ``sequence``: the files that
     the names stand for, if these are folders or videos; ``choice``: the command's options for
@@ -231,7 +237,9 @@ class MeasureRun(StagedRun[MeasureCase]):
 
         Raises InputError if the mesh isn't on the image or the mask, or its elements overlap.
         """
-        mesh, unit = quadratic(plane_mesh(read_any_mesh(path), path)), self.case.unit
+        unit = self.case.unit
+        with reading(path, "a mesh"):
+            mesh = quadratic(plane_triangles(read_any_mesh(path), path))
         warnings: tuple[str, ...] = ()
         located = locate(mesh.nodes, mesh.cells, mesh.element, self.grid, str(path))
         covered, here = located.mask, f"in {unit}, from the middle of the image, x right, y up"
@@ -343,6 +351,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         """Run every stage that is not finished; returns the content of ``summary.json``."""
         with exclusive(self.folder):
             require_writable(self.folder)
+            require_any_frame(tuple(self.case.files.values()), self.reference)
             gauges = read_gauges(self.case.gauges) if self.case.gauges else ()
             gauges = along_axes(gauges, self.case.angle)
             for gauge in gauges:  # InputError before measuring, if one is beside the material

@@ -47,11 +47,22 @@ def read_mesh(path: str) -> Arrays:
     """``points``, ``cells/N/TYPE``, ``cell_sets/N/NAME`` and ``point_data/NAME`` of a mesh."""
     import meshio
 
+    _add_plane_elements()
     mesh = meshio.read(path)
     cells = {f"cells/{k}/{block.type}": block.data for k, block in enumerate(mesh.cells)}
     fields = {f"point_data/{name}": values for name, values in mesh.point_data.items()}
     sets = {f"cell_sets/{k}/{n}": s for n, v in mesh.cell_sets.items() for k, s in enumerate(v)}
     return {"points": mesh.points, **cells, **fields, **sets}
+
+
+def _add_plane_elements() -> None:
+    """Complete meshio's list of Abaqus' plane elements: plane strain, reduced, hybrid, ..."""
+    from meshio.abaqus._abaqus import abaqus_to_meshio_type as known
+
+    for nodes, name in {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8"}.items():
+        for kind in ("CPS", "CPE", "CPEG"):
+            for end in ("", "H", "I", "IH", "M", "MH", "R", "RH"):
+                known[f"{kind}{nodes}{end}"] = name
 
 
 KINDS = {"mat": read_mat, "mesh": read_mesh}

@@ -135,7 +135,19 @@ def described(error: ValidationError, model: type[Any] | None, skipped: int = 0)
         return f"unknown key {where}{nearest(str(place[-1]), known)}"
     if first["type"] == "missing":
         return f"expected {where}, got none"
-    return f"{where}: {expected}, got {first['input']!r:.80}"
+    what = _EXPECTED.get(first["type"], expected.replace("Input should be", "expected"))
+    what = what.format(**first.get("ctx", {}))
+    return f"{where}: {what}, got {first['input']!r:.80}".removeprefix(": ")
+
+
+_EXPECTED = {
+    "tuple_type": "expected a list",
+    "list_type": "expected a list",
+    "dataclass_type": "expected a table",
+    "string_type": "expected a text",
+    "too_long": "expected at most {max_length} values",
+}
+"""Descriptions of pydantic's errors by type, where its own speak of Python."""
 
 
 def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[str]:

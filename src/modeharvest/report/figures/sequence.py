@@ -55,7 +55,9 @@ def write_watch_page(
         if test.rows:
             figures["Amplitude of the pattern"] = draw_amplitude(test, last)
         if last is not None:
-            figures["Growth: the line ends at the strain of buckling"] = draw_growth(test, last)
+            figures["Growth: the line ends at the predicted strain of buckling"] = draw_growth(
+                test, last
+            )
     content = {
         "title": escape(title or "A running test"),
         "refresh": "" if test.conclusion else f'<meta http-equiv="refresh" content="{_RELOAD_S}">',
@@ -64,9 +66,12 @@ def write_watch_page(
             f"<figure><figcaption>{name}</figcaption>{to_svg(drawn, f'f{k}', name)}</figure>"
             for k, (name, drawn) in enumerate(figures.items())
         ),
-        "skipped": "".join(
+        "skipped": "<h2>Not used</h2>" * bool(test.skipped)
+        + "<ul>"
+        + "".join(
             f"<li>{escape(row['name'])}: {escape(row['reason'])}</li>" for row in test.skipped[-20:]
-        ),
+        )
+        + "</ul>",
     }
     with atomic(path) as temporary:
         temporary.write_text(_PAGE.substitute(content), "utf-8")
@@ -76,18 +81,25 @@ def watch_text(test: WatchedTest) -> str:
     """Summary of a watched test, in a few sentences."""
     if not test.rows:
         return f"No photograph has been measured yet. {test.conclusion}"
-    last, found = test.rows[-1], test.predictions[-1]
+    last, found, count = test.rows[-1], test.predictions[-1], len(test.rows)
     text = (
-        f"{len(test.rows)} photographs, the last at a strain of {100 * last['strain']:.2f} %: "
-        f"pattern {last['pattern_px']:.2f} px rms. "
+        f"{count} photograph{'s' * (count > 1)}, the last at a strain of "
+        f"{100 * last['strain']:.2f} %: pattern {last['pattern_px']:.2f} px rms. "
     )
-    if found is None or not found.is_useful:
-        text += "The pattern's growth doesn't show yet at which strain the specimen buckles."
-    else:
+    if (buckled := test.buckled) is not None:
+        low, high = (f"{100 * strain:.2f}" for strain in buckled)
+        text += f"The specimen has buckled: the pattern grew fastest from {low} to {high} %. "
+    if found is not None and found.is_useful:
+        is_reached = buckled is None and float(test.columns[0].max()) >= found.critical
         text += (
-            f"It buckles at {100 * found.critical:.2f} % (95 % interval: {found.interval}), by "
-            f"extrapolation of the growth up to {100 * found.largest:.2f} %."
+            f"Buckling {'is' if buckled is None else 'was'} predicted at "
+            f"{100 * found.critical:.2f} % (95 % interval: {found.interval}), by extrapolation of "
+            f"the growth up to {100 * found.largest:.2f} %."
+            + " This strain is reached."
+            * is_reached
         )
+    elif buckled is None:
+        text += "The pattern's growth doesn't show yet at which strain the specimen buckles."
     return f"{text} {test.conclusion}"
 
 
@@ -145,8 +157,9 @@ _PAGE = Template("""<!doctype html>
 $refresh<title>$title · modeharvest</title><style>
 :root { color-scheme: light dark; --muted: light-dark(#6a7078, #9aa1ab); }
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem; }
-main { columns: 2 360px; column-gap: 24px; } ul { color: var(--muted); font-size: .9rem; }
+main { columns: 2 360px; column-gap: 24px; } h2 { font-size: 1rem; }
+ul { color: var(--muted); font-size: .9rem; }
 figure { margin: 0 0 16px; break-inside: avoid; } figcaption { font-weight: 600; }
 svg { width: 100%; height: auto; }</style></head>
-<body><h1>$title</h1><p>$lead</p><main>$figures</main><ul>$skipped</ul></body></html>
+<body><h1>$title</h1><p>$lead</p><main>$figures</main>$skipped</body></html>
 """)

@@ -44,6 +44,7 @@ from modeharvest.imaging.photographs.photograph import (
     read_frame,
     read_photograph,
     read_reference,
+    require_any_frame,
 )
 from modeharvest.report.model.text import text_of
 from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
@@ -257,6 +258,8 @@ def prepare(
 
     rigid: dict[str, RigidMotion] = {}
     reference = read_reference(base / images.reference)
+    deformed = named_files(base, images.deformed)
+    require_any_frame(deformed, reference)
     own = _material(reference, base / table.material if table.material else None, window)
     own = own if table.material else _one_specimen(own, cell_px)
     save("reference", reference, own)
@@ -264,7 +267,6 @@ def prepare(
     if case.local.code != "file":  # other codes' fields include the rigid motion
         with suppress(InputError):
             lattice = find_hole_lattice(read_mask(folder / "reference_mask.tif"))
-    deformed = named_files(base, images.deformed)
     masks = of_each_photograph(case, table.deformed_material, "specimen.deformed_material")
     names, skipped = [], list(case.sequence.skipped if case.sequence else ())
     notes = [*reference.notes, *own.text, *(case.sequence.notes if case.sequence else ())]

@@ -51,7 +51,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, sha256_of, write_json
 from modeharvest.util.stages import digest, exclusive
 from modeharvest.util.typed import to_plain
-from modeharvest.validation.growth import Prediction, follow_growth, half_wave
+from modeharvest.validation.growth import Prediction, fastest_growth, follow_growth, half_wave
 from modeharvest.validation.onset import load_axis, mean_strain
 
 _PIXELS = 0.8e6
@@ -104,6 +104,11 @@ class WatchedTest:
         self._predicted = follow_growth(self.columns, self._predicted)
         return self._predicted
 
+    @property
+    def buckled(self) -> tuple[float, float] | None:
+        """The strains between which the pattern grew fastest, once it has buckled; else None."""
+        return fastest_growth(self.columns) if self.rows else None
+
     def of_file(self, name: str) -> dict[str, Any] | None:
         """The entry of a photograph, measured or skipped; None if there is none."""
         return next((e for e in (*self.rows, *self.skipped) if e["name"] == name), None)
@@ -142,7 +147,7 @@ class WatchedTest:
         """The results and predictions as plain JSON values."""
         content = {"frames": self.rows, "skipped": self.skipped, "conclusion": self.conclusion}
         last: Prediction | None = next(reversed(self.predictions), None)
-        return {**content, "prediction": to_plain(last)}
+        return {**content, "prediction": to_plain(last), "buckled": to_plain(self.buckled)}
 
 
 class QuickMeasurement:
@@ -415,5 +420,5 @@ def _line(test: WatchedTest, name: str) -> str:
         f"{100 * row['strain']:.2f} %, pattern {row['pattern_px']:.2f} px, {row['seconds']:.1f} s"
     )
     if found and found.is_useful:
-        text += f"; buckling at {100 * found.critical:.2f} % ({found.interval})"
-    return text
+        text += f"; buckling predicted at {100 * found.critical:.2f} % ({found.interval})"
+    return f"{text}; buckled" if test.buckled else text
