@@ -258,9 +258,8 @@ CASES: dict[str, Callable[[Path], Images]] = {
         filled(folder, (2.4, -1.7), 3.0, 0.0), slice(200, 260), slice(300, 380)
     ),
     "turn by 10°": lambda folder: rigid(folder, (5.3, -8.6), 10.0),
-    "turn by 10°, lens of 0.7 px": lambda folder: rigid(folder, (5.3, -8.6), 10.0, camera=blurring),
-    "turn by 10°, lens of 0.7 px, speckle of 12 px, noise of 0.5 %": lambda folder: rigid(
-        folder, (5.3, -8.6), 10.0, 0.005, 2.5, blurring
+    "turn by 10°, lens of 0.7 px, speckle of 12 px": lambda folder: rigid(
+        folder, (5.3, -8.6), 10.0, 0.0, 2.5, blurring
     ),
     "shift by 0.6 px, noise of 1 %": lambda folder: rigid(folder, (0.37, -0.41), 0.0, 0.01),
     "turn by 10°, noise of 1 %": lambda folder: rigid(folder, (5.3, -8.6), 10.0, 0.01),

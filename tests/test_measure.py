@@ -623,7 +623,7 @@ def test_a_small_specimen_in_a_large_picture_is_found(half: tuple[float, float],
 
 
 def test_a_lens_does_not_mix_background_into_the_displacement() -> None:
-    """A blur of 0.7 px made edges of a turned plate drift by a pixel: 0.1 px rms."""
+    """A blur of 0.7 px made edges of a turned plate drift: 0.23 px rms, 1.9 px at most."""
     grid, turn = PixelGrid.centred(300, 360, 1.0), np.deg2rad(8.0)
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     x, pattern = np.stack(np.meshgrid(grid.x, grid.y), axis=-1), Speckle(SpeckleSpec(), grid.shape)
