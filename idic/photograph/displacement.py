@@ -177,6 +177,7 @@ def displacement_from(
 
     ``pair``: with the mask of the reference; brightness may differ. InputError if the images don't
     overlap; and as for :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
+    ``options``: their ``edge_px`` also holds in the deformed image, whose mask isn't known.
     ``light_degree``: of the polynomials by which gain and offset vary over the reference, if these
     describe the light; else it is taken from around each pixel. None for images of one brightness.
     """
