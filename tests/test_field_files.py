@@ -125,7 +125,7 @@ def test_failures_of_the_code_are_kept_as_such(tmp_path: Path) -> None:
         ("x,y,u\n1,2,3\n", {"units": "mm", "y_axis": "up"}, "expected columns for v, got 'x', 'y'"),
         ("x,y,u,v\n1,2,3,4\n", {"y_axis": "up"}, "give units='px' or 'mm'"),
         ("x,y,u,v\n1,2,3,4\n", {"units": "mm"}, "give y_axis"),
-        ("x,y,u,v\n1,2,3,4\n", {"units": "px", "y_axis": "down"}, "expected a grid"),
+        ("x,y,u,v\n1,2,3,4\n", {"units": "px", "y_axis": "down"}, "give --image, or a grid"),
         ("x,y,u,v\n1,2,3,4\n1,2,3\n", {"units": "mm", "y_axis": "up"}, "line 3: expected 4 values"),
         ("x,y,u,v\n1,2,3,4\n1,2,3,q\n", {"units": "mm", "y_axis": "up"}, "a number, got 'q'"),
         ("x,y,u,v\n1,2,,4\n", {"units": "mm", "y_axis": "up"}, "at least one valid point"),
