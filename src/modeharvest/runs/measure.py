@@ -216,8 +216,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     @cached_property
     def _options(self) -> FiniteElementOptions:
-        mixed = mixed_edge_px(self.reference.image, self.material.mask)
-        return FiniteElementOptions(edge_px=mixed)
+        return FiniteElementOptions(edge_px=mixed_edge_px(self.reference.image, self.material.mask))
 
     def _material(self) -> MeshedMaterial:
         """Mesh the measurable part of the given mask, or of the material found by speckle."""
