@@ -17,7 +17,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parent.parent
 TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
 MOST_ENTRIES = 12
-MOST_MODULES, MOST_LINES = 172, 35_852
+MOST_MODULES, MOST_LINES = 172, 35_853
 """See docs/decisions/0014-size.md; of everything that has no bound of its own."""
 
 HOMOGENIZATION = (
