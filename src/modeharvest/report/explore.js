@@ -233,10 +233,10 @@
       this.ownState.hidden = data.states.length < 2;
       this.choice.value = quantity;
       this.ownState.value = own;
-      this.choice.onchange = () => { this.quantity = Number(this.choice.value); draw(); };
+      this.choice.onchange = () => { this.show(Number(this.choice.value)); draw(); };
       this.ownState.onchange = () => { this.own = Number(this.ownState.value); draw(); };
-      for (const input of [this.low, this.high]) input.onchange = () => this.setLimits();
-      find(".ex-auto").onclick = () => { limits[this.quantity] = null; draw(); };
+      for (const input of [this.low, this.high]) input.onchange = () => this.readLimits();
+      find(".ex-auto").onclick = () => this.setLimits(null);
       find(".ex-fit").onclick = () => this.fitLimits();
       for (const button of $$("[data-save]", this.element))
         button.onclick = () => this.save(button.dataset.save);
@@ -260,12 +260,28 @@
       return [0, high > 0 ? high : 1];
     }
 
-    setLimits() {
+    show(quantity) {
+      [this.quantity, this.choice.value] = [quantity, quantity];
+      this.refuse(false);
+    }
+
+    /** Whether what stands in the limits' inputs is refused; there it stays until it is corrected. */
+    refuse(refused) {
+      for (const input of [this.low, this.high]) input.setAttribute("aria-invalid", String(refused));
+    }
+
+    /** Give the colours these ends; null: those of all states. */
+    setLimits(pair) {
+      limits[this.quantity] = pair;
+      this.refuse(false);
+      draw();
+    }
+
+    readLimits() {
       const [, factor] = unitOf(this.spec), pair = [this.low, this.high].map((i) => read(i.value) / factor);
-      const good = pair.every(Number.isFinite) && pair[0] < pair[1];
-      for (const input of [this.low, this.high]) input.setAttribute("aria-invalid", String(!good));
-      if (good) { limits[this.quantity] = pair; draw(); }
-      else say("Limits have to be two numbers, the lower one first.");
+      if (pair.every(Number.isFinite) && pair[0] < pair[1]) return this.setLimits(pair);
+      this.refuse(true);
+      say("Limits have to be two numbers, the lower one first.");
     }
 
     fitLimits() {
@@ -274,7 +290,7 @@
       for (const i of this.index ?? []) {
         if (i >= 0 && known[i]) { low = Math.min(low, values[i]); high = Math.max(high, values[i]); }
       }
-      if (low < high) { limits[this.quantity] = [low, high]; draw(); }
+      if (low < high) this.setLimits([low, high]);
     }
 
     /** Millimetres to device pixels: scale, and where the view's middle lies. */
@@ -406,8 +422,8 @@
     labels() {
       const [unit, factor] = unitOf(this.spec), [low, high] = this.ends;
       for (const [input, end] of [[this.low, low], [this.high, high]]) {
-        input.value = written(end * factor, 3);
-        input.setAttribute("aria-invalid", "false");
+        const typing = input === document.activeElement || input.getAttribute("aria-invalid") === "true";
+        if (!typing) input.value = written(end * factor, 3);
       }
       const ramp = $(".ex-ramp canvas", this.element).getContext("2d"), image = ramp.createImageData(256, 1);
       image.data.set(this.lut);
@@ -750,7 +766,7 @@
   /** Show a quantity of a state, as a static picture has it. */
   const jump = (quantity, state) => {
     const panel = panels[0];
-    [panel.quantity, panel.choice.value] = [quantity, quantity];
+    panel.show(quantity);
     setState(state);
     root.scrollIntoView();
     panel.over.focus({ preventScroll: true });
